@@ -843,6 +843,44 @@ class SurroundingsTest(parameterized.TestCase):
             found.velocity(x[env_ids], y[env_ids], env_ids), velocity[env_ids]
         )
 
+    @parameterized.parameters('stairs3d', 'ramp3d', 'blocks3d', 'conveyor3d', 'hills3d')
+    def test_beyond_a_window_its_rim_continues(self, source):
+        found = around(source, range(2), np.array([(0.0, 0.0), (8.0, -4.0)]))
+        points = found.centre[:, None] + np.random.default_rng(0).uniform(-60, 60, (2, 400, 2))
+        points = np.concatenate([points, found.centre[:, None] + [[(1e6, 3), (2, -1e300)]] * 2], 1)
+        rim = np.clip(points, found.centre[:, None] - 16, found.centre[:, None] + 16)
+        for query in found.height, found.velocity:
+            expected = query(*np.moveaxis(rim, 2, 0))
+            np.testing.assert_array_equal(query(*np.moveaxis(points, 2, 0)), expected)
+            self.assertTrue(np.isfinite(expected).all())
+        xy = found.centre + np.array([(13.0, 2.0), (900.0, -1e5)])
+        heading = np.array([0.3, -2.0])
+        points = np.moveaxis(self.samples(xy, heading), 2, 0)
+        under = found.height(*xy.T[..., None])
+        np.testing.assert_allclose(
+            found.height_map(xy, heading), found.height(*points) - under, atol=3e-6
+        )
+        flow = found.velocity(*points) - found.velocity(*xy.T[..., None])
+        ahead = np.stack([np.cos(heading), np.sin(heading)], 1)[:, None]
+        np.testing.assert_allclose(
+            found.velocity_map(xy, heading)[:, :1024], (flow * ahead).sum(2), atol=1e-12
+        )
+
+    @parameterized.parameters(
+        (lambda a: a.height(np.zeros((3, 1)), np.zeros((3, 1))), r'\(2, k\)'),
+        (lambda a: a.height(np.zeros((2, 5)), np.zeros((2, 4))), r'\(2, k\)'),
+        (lambda a: a.height_map(*LEVEL, np.array([1])), r'\(1, 2\), \(1,\)'),
+        (lambda a: a.height_map(np.zeros((1, 2)), np.zeros(2)), r'\(2, 2\), \(2,\)'),
+        (lambda a: a.velocity_map(np.zeros((2, 2)), np.zeros(1)), r'\(2, 2\), \(2,\)'),
+        (lambda a: a.height_map(*LEVEL, out=np.zeros((2, 3))), r'\(2, 1024\)'),
+        (lambda a: a.velocity_map(*LEVEL, out=np.zeros((2, 1024))), r'\(2, 2048\)'),
+        (lambda a: a.turn(np.zeros((1, 2))), r'\(2, 2\)'),
+        (lambda a: a.advance(0.1, np.zeros((2, 3))), r'\(2, 2\)'),
+    )
+    def test_wrong_shapes_are_rejected(self, query, expected):
+        with self.assertRaisesRegex(ValueError, f'shapes? .* expected .*{expected}'):
+            query(around('dynamic_obstacles3d', range(2)))
+
     def samples(self, xy, heading):
         """Points of maps, one by one, in the order of the original."""
         points = np.zeros((len(xy), 1024, 2))
@@ -1006,13 +1044,6 @@ class SurroundingsTest(parameterized.TestCase):
             np.testing.assert_array_equal(
                 found.height(x, y)[env_id], ground.height(x[env_id], y[env_id])
             )
-
-    def test_wrong_shapes_are_rejected(self):
-        found = around('plane', [0, 1])
-        with self.assertRaisesRegex(ValueError, r'expected \(2, k\)'):
-            found.height(np.zeros((3, 1)), np.zeros((3, 1)))
-        with self.assertRaisesRegex(ValueError, r'expected \(1, 2\), \(1,\)'):
-            found.height_map(np.zeros((2, 2)), np.zeros(2), np.array([1]))
 
     @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d', 'trail3d2')
     def test_state(self, source):

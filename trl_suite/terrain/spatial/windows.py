@@ -37,6 +37,8 @@ _COUNT = SAMPLES * SAMPLES
 _FAR_AWAY = TURN_DISTANCE**2
 _CELLS_PER_METRE = 1 / GRID
 _LAST = VERTICES - 1.0 - 1e-6
+# m; maps of characters that are not farther from the centre along an axis end inside the window.
+_INSIDE = HALF - math.hypot(AHEAD[1], ASIDE)
 
 # Columns of `SpatialWindows.boxes`: the values of a box fill one cache line of the processor.
 X, Y, HALF_X, HALF_Y, COSINE, SINE, TOP, SLOPE = range(8)
@@ -157,12 +159,13 @@ def height_map(
       ground: windows of all simulations.
       out: array for the heights in m, (1024,).
     """
-    under = height(i, x, y, ground)
+    under, far = height(i, x, y, ground), _looks_out(i, x, y, ground)
     cosine, sine = math.cos(heading), math.sin(heading)
     for v in range(SAMPLES):
         for u in range(SAMPLES):
             at_x, at_y = _sample(u, v, x, y, cosine, sine)
-            out[SAMPLES * v + u] = _fixed(i, at_x, at_y, ground)[0] - under
+            top = height(i, at_x, at_y, ground) if far else _fixed(i, at_x, at_y, ground)[0]
+            out[SAMPLES * v + u] = top - under
     for k in range(ground.mover_top.shape[1]):
         begin_u, end_u, begin_v, end_v = _seen_part(i, k, x, y, cosine, sine, ground)
         for v in range(begin_v, end_v):
@@ -184,7 +187,7 @@ def velocity_map(
     if belts + movers == 0:
         out[:] = 0.0
         return
-    under = velocity(i, x, y, ground)
+    under, far = velocity(i, x, y, ground), _looks_out(i, x, y, ground)
     cosine, sine = math.cos(heading), math.sin(heading)
     still = _turned(0.0, 0.0, under, cosine, sine)
     for v in range(SAMPLES):
@@ -192,7 +195,10 @@ def velocity_map(
             ahead, aside = still
             if belts:
                 at_x, at_y = _sample(u, v, x, y, cosine, sine)
-                east, north = _velocity_of(i, _fixed(i, at_x, at_y, ground)[1], ground)
+                if far:
+                    east, north = velocity(i, at_x, at_y, ground)
+                else:
+                    east, north = _velocity_of(i, _fixed(i, at_x, at_y, ground)[1], ground)
                 ahead, aside = _turned(east, north, under, cosine, sine)
             out[SAMPLES * v + u], out[_COUNT + SAMPLES * v + u] = ahead, aside
     for k in range(movers):
@@ -283,7 +289,7 @@ def keep_moving(
 
 @compiled_inline
 def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
-    """Height of the static surface at a point, and the index of its box; -1 if it is not a box."""
+    """Height of the static surface at a point of the window, and the index of its box, or -1."""
     top, box = ground.level[i], -1
     if ground.grid.shape[1]:
         on_grid = _on_grid(i, x, y, ground)
@@ -311,8 +317,9 @@ def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, i
 
 @compiled_inline
 def _highest(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
-    """As `_fixed`, but with moving boxes, whose indices start at B."""
-    top, box = _fixed(i, x, y, ground)
+    """As `_fixed`, but anywhere, and with moving boxes, whose indices start at B."""
+    centre_x, centre_y = ground.centre[i, 0], ground.centre[i, 1]
+    top, box = _fixed(i, _clamped(x, centre_x), _clamped(y, centre_y), ground)
     for k in range(ground.mover_top.shape[1]):
         middle_x, middle_y = _mover_middle(i, k, ground)
         if (
@@ -374,6 +381,20 @@ def _cell(position: float) -> tuple[int, float]:
         position = 0.0
     cell = int(position) if position > 0.0 else 0
     return cell, position - cell
+
+
+@compiled_inline
+def _looks_out(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
+    """Whether a map of a character may reach beyond its window."""
+    return abs(x - ground.centre[i, 0]) > _INSIDE or abs(y - ground.centre[i, 1]) > _INSIDE
+
+
+@compiled_inline
+def _clamped(position: float, centre: float) -> float:
+    """The position in a window that is nearest to a coordinate, m."""
+    if abs(position - centre) > HALF:
+        return centre + math.copysign(HALF, position - centre)
+    return position
 
 
 @compiled_inline
