@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import io
+import math
 import os
 import pathlib
 import shutil
@@ -24,7 +25,13 @@ from numba.core import event
 import trl_suite
 from trl_suite.util import compiled as module
 from trl_suite.util import interrupts, machine_code
-from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
+from trl_suite.util.compiled import (
+    compiled,
+    compiled_inline,
+    compiled_loop,
+    nearest_index,
+    packed,
+)
 
 PACKAGE = pathlib.Path(trl_suite.__file__).parent
 INNER = """
@@ -122,6 +129,15 @@ class FunctionTest(parameterized.TestCase):
         pair = Pair(np.ones(3), np.zeros(3))
         scale_all(np.arange(3), packed(pair))
         np.testing.assert_array_equal(pair.second, [-2, np.inf, 2])
+
+    @parameterized.parameters(
+        (math.nan, 0), (-math.inf, 0), (-1e300, 0), (-0.5, 0), (0.0, 0), (0.999, 0), (1.0, 1), (6.7, 6),
+        (7.0, 7), (7.5, 7), (8.0, 7), (1e19, 7), (1e300, 7), (math.inf, 7),
+    )  # fmt: skip
+    def test_numbers_become_indices(self, number, index):
+        self.assertEqual(nearest_index(number, 8), index)
+        self.assertEqual(nearest_index.function(number, 8), index)
+        self.assertEqual(nearest_index(number, 1), 0)
 
     def test_a_pack_keeps_its_arrays(self):
         second = np.zeros(2000)

@@ -369,6 +369,36 @@ def dense_pd(rig, env_id, off=(), wanted=None):
     return (pull - kd * DT * acceleration)[3:]
 
 
+class ArgumentsTest(parameterized.TestCase):
+    """What compiled functions get."""
+
+    def test_vectors_of_other_shapes_are_rejected(self):
+        rig = Rig('dog', 3, batch=True)
+        before, size = rig.gait.state.vector.copy(), rig.gait.state.vector.shape[1]
+        for shape in ((3, size + 10_000), (3, size - 1), (2, size), (size,), (1, 3, size)):
+            with self.subTest(shape=shape), self.assertRaisesRegex(ValueError, r'expected \(3, '):
+                rig.gait.apply(rig.env_ids, np.zeros(shape))
+        np.testing.assert_array_equal(rig.gait.state.vector, before)
+
+    def test_simulations_that_do_not_exist(self):
+        rig = Rig('dog', 3, batch=True)
+        for call in rig.gait.begin, rig.gait.torques, rig.gait.advance:
+            with self.assertRaises(IndexError):
+                call(np.array([0, 10**6]))
+
+    @parameterized.parameters(np.nan, np.inf, -np.inf, 1e20, -1e300)
+    def test_any_pitch(self, pitch):
+        rig = Rig('dog')
+        rig.rules.physics.qpos[0, rig.rules.skeleton.qpos[2]] = pitch
+        found = np.zeros((2, 1, len(rig.joints)))
+        machine.write_local_targets(0, rig.rules, found[0])
+        with np.errstate(invalid='ignore'):
+            machine.write_local_targets.function(0, rig.rules, found[1])
+        np.testing.assert_array_equal(found[0], found[1])
+        hips = found[0, 0, rig.rules.machine.legs[:, 0]]
+        self.assertFalse((np.abs(hips) > 1e-14 * abs(pitch) + 10).any())
+
+
 class DynamicsTest(parameterized.TestCase):
     """Compiled functions against the engine's own."""
 

@@ -291,6 +291,19 @@ class ProcessTest(parameterized.TestCase):
         self.assertLess(rise[~profile.vertical].max(), 0.02)
         self.assertGreater(rise[~profile.vertical].min(), 0)
 
+    @parameterized.parameters(math.nan, math.inf, -math.inf, -5.0, 1e6, 1e300)
+    def test_parameters_beyond_the_limits(self, value):
+        """They are checked in a `Terrain`; a user's generator may call the function itself."""
+        for kind in ('gaps', 'walls', 'steps', 'mixed', 'narrow_gaps', 'cliffs'):
+            function, defaults, _ = terrain.GENERATORS[f'var2d_{kind}']
+            for parameter in defaults:
+                with self.subTest(kind, parameter=parameter):
+                    profile = function(
+                        {**defaults, parameter: value}, 20.0, np.random.default_rng(0)
+                    )
+                    self.assertGreaterEqual(len(profile.heights), 800)
+                    self.assertEqual(profile.vertical.shape, profile.heights.shape)
+
     def test_features_without_extent_end(self):
         nothing = {
             key: 0

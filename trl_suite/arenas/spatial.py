@@ -18,7 +18,7 @@ from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capac
 from trl_suite.terrain.spatial.ground import Random
 from trl_suite.terrain.spatial.surroundings import ALL, EnvIds, positions
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, compiled_loop, nearest_index, packed
 
 ELEVATION = 40.0  # m; largest difference of heights of a grid within a window
 BASE = 1.0  # m; thickness of height fields below their lowest point
@@ -416,7 +416,7 @@ def _write_boxes(
         geom_quat[geom, 1] = math.sin(half_yaw) * math.sin(half_angle)
         geom_quat[geom, 2] = -math.cos(half_yaw) * math.sin(half_angle)
         geom_quat[geom, 3] = math.sin(half_yaw) * math.cos(half_angle)
-        shade = math.floor(2 * middle[k, 0]) % 2
+        shade = nearest_index(np.floor(2 * middle[k, 0]) % 2.0, len(shades))
         for channel in range(4):
             geom_rgba[geom, channel] = shades[shade, channel]
 

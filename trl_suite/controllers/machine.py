@@ -10,7 +10,6 @@ PD after Tan, Liu, Turk (2011).
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -158,7 +157,7 @@ def write_local_targets(i: int, gait: GaitRules, out: np.ndarray) -> None:
         hip = machine.legs[leg, 0]
         own = qpos[i, skeleton.qpos[3 + hip]]
         angle = hip_angle(i, leg, machine, skeleton, qpos) + own
-        angle -= 2 * np.pi * math.ceil((angle - np.pi) / (2 * np.pi))  # to (-pi, pi]
+        angle -= 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))  # to (-pi, pi]
         out[i, hip] -= angle - own
 
 

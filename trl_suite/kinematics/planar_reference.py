@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import mujoco
 import numpy as np
 
 from trl_suite.motion import Clip
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, nearest_index
 
 SAMPLES = 1024  # per cycle; for the suite's clips, link positions are then exact to 0.5 mm
 _SAMPLES = np.full(1, float(SAMPLES))
@@ -34,9 +33,8 @@ class ClipTable(NamedTuple):
 def feature(phase: float, column: int, clip: ClipTable) -> float:
     """Returns a feature of the clip at a phase in [0, 1)."""
     u = phase * SAMPLES
-    sample = min(max(math.floor(u), 0.0), SAMPLES - 1.0)
-    k = int(sample)
-    return clip.steps[k, column] * (u - sample) + clip.table[k, column]
+    k = nearest_index(u, SAMPLES)
+    return clip.steps[k, column] * (u - k) + clip.table[k, column]
 
 
 class Reference:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from typing import NamedTuple
 
 import mujoco
@@ -23,7 +22,7 @@ from trl_suite.kinematics.spatial import (
 )
 from trl_suite.motion import Clip, Steps, quaternion
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.util.compiled import compiled_inline, packed
+from trl_suite.util.compiled import compiled_inline, nearest_index, packed
 
 CYCLE_SAMPLES = 256  # of a looping clip
 STEP_SAMPLES = 64  # of a single step
@@ -50,8 +49,8 @@ class TrackTable(NamedTuple):
 def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
     """Returns the row of the table for a share in [0, 1] of a track, and the fraction to the next."""
     u = share * tracks.samples
-    sample = min(max(math.floor(u), 0.0), tracks.samples - 1.0)
-    return int(sample) + track * (tracks.samples + 1), u - sample
+    sample = nearest_index(u, tracks.samples)
+    return sample + track * (tracks.samples + 1), u - sample
 
 
 @compiled_inline

@@ -11,7 +11,9 @@ A compiled function takes numbers, arrays and (named) tuples of them, and return
 numbers. It may call other compiled functions and `math`. It must not allocate memory: Numba raises
 an error for a function that does, since reference counting is disabled (it would cost more than
 most functions, and threads would contend for the counts). It never raises: a division by zero gives
-infinity or NaN, as in NumPy. Indices are not checked. It runs without the global interpreter lock.
+infinity or NaN, as in NumPy. Indices are not checked: arrays that users give are checked before, and
+an index is computed from a state of the physics by `nearest_index`. With `NUMBA_BOUNDSCHECK=1` and an
+empty cache folder, a wrong index raises an IndexError. It runs without the global interpreter lock.
 
 A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
 in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
@@ -127,6 +129,17 @@ def compiled_inline(function: Callable[..., Any]) -> Compiled:
 def compiled_loop(function: Callable[..., Any]) -> Compiled:
     """Decorates a loop over simulations that Python calls with packs; see `packed`."""
     return Compiled(function)
+
+
+@compiled_inline
+def nearest_index(number: float, count: int) -> int:
+    """Returns a number rounded down and clamped to 0, 1, ..., count - 1; 0 for NaN.
+
+    In compiled code, `int`, `math.floor` and `math.ceil` of NaN and of huge numbers are undefined.
+    """
+    if not number > 0.0:
+        return 0
+    return int(number) if number < count - 1 else count - 1
 
 
 def packed(value: Any) -> Any:

@@ -7,7 +7,6 @@ Source: the step scenario of the original, with its configuration for the planar
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -154,7 +153,7 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
     layout, measurement, terms = rules.layout, rules.measurement, rules.outcome.reward_terms
     phase, swing = rules.state.phase[i], 1 - plan.stance[i]
     twice = 2 * phase
-    late = twice - math.floor(twice) > 0.5
+    late = twice - np.floor(twice) > 0.5
     end_effector = 0.0
     for k in range(measurement.effectors.shape[1]):
         if k == swing and late:

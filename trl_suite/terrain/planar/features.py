@@ -13,7 +13,6 @@ distribution, not draw by draw.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ import numpy as np
 from trl_suite.terrain.checks import LIMITS, Parameters
 from trl_suite.terrain.planar.generators import SPACING, Profile, cells, register
 from trl_suite.util import random
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
 LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
 
@@ -65,12 +64,13 @@ _DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
 _LEDGES = list(CLIFFS).index('CliffMiniCountMax')
 _FIRST_WALL, _FIRST_STEP = len(GAPS), len(GAPS) + len(WALLS)
 _NAMES = tuple(tuple(names) for names in (GAPS, STEPS, WALLS, _MIXTURE, NARROW_GAPS, CLIFFS))
-_MOST_RUNS = 3 * round(LIMITS['NarrowGapCount'][1]) + 3  # of a feature
+_MOST_COUNT, _MOST_CELLS = round(LIMITS['NarrowGapCount'][1]), cells(LIMITS['GapW'][1])
+_MOST_RUNS = 3 * _MOST_COUNT + 3  # of a feature
 
 
 @compiled_inline
 def _cells(length: float) -> int:
-    return math.ceil(length / SPACING - 1e-9)
+    return nearest_index(np.ceil(length / SPACING - 1e-9), _MOST_CELLS + 1)
 
 
 @compiled_inline
@@ -82,7 +82,7 @@ def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
 @compiled_inline
 def _integer(low: float, high: float, bits: int) -> int:
     """Draws an integer, both ends included; interpolated counts are truncated only here."""
-    first, last = int(low), int(high)
+    first, last = nearest_index(low, _MOST_COUNT + 1), nearest_index(high, _MOST_COUNT + 1)
     return first + int((last - first + 1) * random.draw(bits))
 
 

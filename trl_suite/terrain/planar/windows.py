@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trl_suite.terrain.planar.generators import SPACING
-from trl_suite.util.compiled import compiled_inline
+from trl_suite.util.compiled import compiled_inline, nearest_index
 
 FARTHEST = (
     1e4  # m from its window; a character farther away has diverged, and its window is not refilled
@@ -63,7 +63,7 @@ def height(i: int, x: float, ground: PlanarWindows) -> float:
     """
     u = x * _CELLS_PER_METRE - ground.start[i]
     whole = np.floor(u)
-    cell = _within(whole, ground.heights.shape[1])
+    cell = nearest_index(whole, ground.heights.shape[1])
     return (u - whole) * ground.rises[i, cell] + ground.heights[i, cell]
 
 
@@ -71,7 +71,7 @@ def height(i: int, x: float, ground: PlanarWindows) -> float:
 def slope(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the slope dh/dx of the ground of simulation i at x, m."""
     whole = np.floor(x * _CELLS_PER_METRE - ground.start[i])
-    return ground.rises[i, _within(whole, ground.heights.shape[1])] / SPACING
+    return ground.rises[i, nearest_index(whole, ground.heights.shape[1])] / SPACING
 
 
 @compiled_inline
@@ -96,7 +96,7 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
         return ground.wide[i, 0]
     if whole >= first + last:
         return ground.wide[i, last]
-    cell = _within(whole - first, last)
+    cell = nearest_index(whole - first, last)
     left = ground.wide[i, cell]
     return left + (position - whole) * (ground.wide[i, cell + 1] - left)
 
@@ -105,11 +105,3 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
 def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether the window of simulation i must be refilled for a character at x, m."""
     return ground.reach < abs(x - ground.centre[i]) < FARTHEST
-
-
-@compiled_inline
-def _within(number: float, count: int) -> int:
-    """The nearest of the integers 0, 1, ..., count - 1; 0 for NaN."""
-    if not number > 0.0:
-        return 0
-    return int(number) if number < count - 1 else count - 1

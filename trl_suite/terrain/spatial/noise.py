@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
 TILE = 256  # points of the tile along each axis; the last equals the first
 PERIOD = 16  # lattice cells over the tile
@@ -155,7 +155,7 @@ def _sum_octaves(
 def _cell(position: float) -> tuple[int, np.float32]:
     """Index of the tile's cell at a position in tiles, and the position in that cell."""
     position = position % 1.0 * (TILE - 1)
-    cell = min(int(position), TILE - 2)
+    cell = nearest_index(position, TILE - 1)
     return cell, np.float32(position - cell)
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
 HALF = 16.0  # m; half side of a window
 SHIFT = 4.0  # m; window centres are multiples of it; windows of characters farther away are moved
@@ -400,10 +400,7 @@ def _clamped(position: float, centre: float) -> float:
 @compiled_inline
 def bin_of(distance: float, count: int) -> int:
     """Index of the bin at a distance from the rim of a window, m."""
-    position = distance * (count / (2 * HALF))
-    if not position > 0.0:  # or it is NaN
-        return 0
-    return int(position) if position < count else count - 1
+    return nearest_index(distance * (count / (2 * HALF)), count)
 
 
 @compiled_inline
@@ -431,10 +428,10 @@ def _seen_part(
     if not (-reach < u < SAMPLES + reach and -reach < v < SAMPLES + reach):
         return 0, 0, 0, 0
     return (
-        max(int(u - reach), 0),
-        min(int(u + reach) + 1, SAMPLES),
-        max(int(v - reach), 0),
-        min(int(v + reach) + 1, SAMPLES),
+        nearest_index(u - reach, SAMPLES),
+        nearest_index(u + reach, SAMPLES) + 1,
+        nearest_index(v - reach, SAMPLES),
+        nearest_index(v + reach, SAMPLES) + 1,
     )
 
 
