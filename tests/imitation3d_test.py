@@ -638,6 +638,12 @@ class HelperTest(parameterized.TestCase):
         ):  # fmt: skip
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 suite.build(*arguments)
+        sizes = (1, 4, 4, 4, 4, 1, 4)  # those of the torso and of the right knee are exchanged
+        pose = [0, 0, 1, 1, 0, 0, 0] + [n for size in sizes for n in [1, 0, 0, 0][:size]]
+        joints = motion.load('biped3d_walk').joints
+        clip = motion.Clip('other', (0, 1), [pose, pose], 'free', joints, sizes, loop=True)
+        with self.assertRaisesRegex(ValueError, "columns for its joints; character 'biped3d' has"):
+            suite.build('biped3d', clip=clip)
         once = motion.load_steps('biped3d_mocap').clip(2)
         with self.assertRaisesRegex(ValueError, 'not looping'):
             suite.build('biped3d_mocap', clip=once)

@@ -372,6 +372,12 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
             f'{spec.name!r}: expected a spatial character with these joints, not '
             f'{"one" if spec.spatial else "a planar one"} with {", ".join(spec.joints)}'
         )
+    sizes = tuple(np.where(character.spherical, 4, 1).tolist())
+    if motion.sizes != sizes:
+        raise ValueError(
+            f'motion {motion.name!r} has {motion.sizes} columns for its joints; character '
+            f'{spec.name!r} has {sizes}'
+        )
 
 
 def position_range(
