@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import textwrap
 import time
 import unittest
@@ -18,11 +19,14 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import pytest
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 from numba.core import event
 
 import trl_suite
+from trl_suite import suite
+from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.util import compiled as module
 from trl_suite.util import interrupts, machine_code
 from trl_suite.util.compiled import (
@@ -32,6 +36,7 @@ from trl_suite.util.compiled import (
     nearest_index,
     packed,
 )
+from trl_suite.vector import VectorEnvironment
 
 PACKAGE = pathlib.Path(trl_suite.__file__).parent
 INNER = """
@@ -579,6 +584,99 @@ class DisabledTest(parameterized.TestCase):
         for id_, digest in zip(self.IDS, found, strict=True):
             with self.subTest(id_):
                 self.assertEqual(digest, here['digest'](id_))
+
+
+MOTORS = {
+    'actuators': {'torque_speed': True, 'torque_pose': True, 'delay': (0, 40), 'noise': 0.1},
+}
+WORLDS = {'randomize': 'harsh', 'sensors': {'preset': 'harsh', 'delay': (0, 4)}}
+# An environment of each task type, and options that have compiled functions of their own.
+EXTREME = {
+    'planar_imitation': ('PD_Dog2D_Mixed_Terrain-v0', {}),
+    'spatial_imitation': ('PD_Biped3D_Imitate-Stairs_Terrain-v0', WORLDS),
+    'planar_footsteps': ('PD_Biped2D_LLC_Flat_Step-v0', MOTORS),
+    'spatial_footsteps': ('PD_Biped3D_LLC_Trail_Step-v0', MOTORS),
+    'goal_navigation': ('PD_Biped3D_HLC_DynamicsObstacles-v0', WORLDS),
+    'soccer': ('PD_Biped3D_HLC_Soccer-v0', {}),
+    'direct_navigation': ('PD_Biped3D_Terrain_Forest_Hard-v0', {}),
+    'direct_soccer': ('PD_Biped3D_Terrain_Soccer_Hard-v0', {}),
+    'gait': ('FSM_Biped2D_Terrain_Stairs_Rugged-v0', WORLDS),
+    'planar_walk': (('dog', 'mixed'), {'terrain_observation': 50}),
+    'spatial_walk': (('biped3d', 'conveyor3d'), {'terrain_observation': 'height'}),
+}
+VALUES = (1e3, -9999.0, 999_999.0, -1e6, 1e9, -1e300, np.nan, np.inf)
+
+
+def extreme_states(task):
+    """Yields the arrays, columns and values of extreme states."""
+    world, figure, spatial = task.world, task.figure, task.character.spec.spatial
+    position, velocity = 7 if spatial else 3, 6 if spatial else 3  # columns of the root
+    turn = figure.pose_qpos[3:7] if spatial else figure.pose_qpos[2:3]
+    yield world.qpos, turn, (0, 1, 0, 0) if spatial else np.pi  # upside down
+    for value in VALUES:
+        yield world.qpos, figure.pose_qpos[:1], value  # x
+        yield world.qpos, turn, value
+        yield world.qpos, figure.pose_qpos[position:], value
+        yield world.qvel, figure.pose_dof[:1], value
+        yield world.qvel, figure.pose_dof[:velocity], value
+        yield world.qvel, slice(None), value
+        yield world.ctrl, slice(None), value
+
+
+def survive(task_type):
+    """Sets extreme states in one of two simulations; what comes back must be finite."""
+    which, options = EXTREME[task_type]
+    if isinstance(which, tuple):
+        which = suite.combine(which[0], terrain=which[1], task='walk')
+    many = VectorEnvironment(
+        which, 2, 1, 3, autoreset='disabled', flat_observation=True, task_kwargs=options
+    )
+    idle = np.zeros((2, len(many.action_map)))
+    for forward in True, False:
+        for array, columns, value in extreme_states(many.task):
+            assert np.isfinite(many.reset()).all()
+            array[1, columns] = value
+            if forward:
+                many.task.world.forward(many.task.world.all_ids)
+            for _ in range(2):
+                step = many.step(idle)
+                finite = np.isfinite(step.observation).all() and np.isfinite(step.reward).all()
+                assert finite, (columns, value, forward)
+                many.reset(step.terminated | step.truncated)
+
+
+@pytest.mark.slow
+class BoundsCheckTest(parameterized.TestCase):
+    """No index of compiled code depends on a state of the physics without being checked."""
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        folder = cls.enterClassContext(tempfile.TemporaryDirectory())
+        cls.environ = {
+            **os.environ, 'NUMBA_BOUNDSCHECK': '1', 'NUMBA_CACHE_DIR': folder,
+            'PYTHONPATH': os.pathsep.join([*sys.path, str(pathlib.Path(__file__).parent)]),
+        }  # fmt: skip
+
+    def ended(self, script):
+        """Returns status and messages of a process that checks indices."""
+        script = f'import warnings; warnings.simplefilter("ignore"); from compiled_test import *; {script}'
+        found = subprocess.run(
+            [sys.executable, '-c', script], capture_output=True, text=True, env=self.environ
+        )
+        return found.returncode, found.stderr
+
+    def test_a_wrong_index_raises_an_error(self):
+        status, messages = self.ended(
+            'scale_all(np.array([0, 3]), packed(Pair(*np.zeros((2, 3)))))'
+        )
+        self.assertIn('IndexError: index is out of bounds', messages)
+        self.assertEqual(status, 1)
+
+    @parameterized.parameters(*TASK_TYPES)
+    def test_extreme_states(self, task_type):
+        status, messages = self.ended(f'survive({task_type!r})')
+        self.assertEqual(status, 0, messages)
 
 
 if __name__ == '__main__':
