@@ -12,8 +12,8 @@ numbers. It may call other compiled functions and `math`. It must not allocate m
 an error for a function that does, since reference counting is disabled (it would cost more than
 most functions, and threads would contend for the counts). It never raises: a division by zero gives
 infinity or NaN, as in NumPy. Indices are not checked: arrays that users give are checked before, and
-an index is computed from a state of the physics by `nearest_index`. With `NUMBA_BOUNDSCHECK=1` and an
-empty cache folder, a wrong index raises an IndexError. It runs without the global interpreter lock.
+an index is computed from a state of the physics by `nearest_index`. With `NUMBA_BOUNDSCHECK=1` a wrong
+index raises an IndexError. It runs without the global interpreter lock.
 
 A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
 in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
