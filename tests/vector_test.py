@@ -311,6 +311,21 @@ class PartialBatchTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.observation, expected.observation[[1, 0, 1]])
         np.testing.assert_array_equal(step.reward, expected.reward[[1, 0, 1]])
 
+    @parameterized.product(id_=KINDS, sources=([1, 0], [1, 2, 0], [2, 2, 2]))
+    def test_copies_within_the_environment(self, id_, sources):
+        """A swap, a cyclic shift and a fan-out: rows get states from before the call."""
+        environments, copies = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (3, len(environments.action_map)))
+        for each in environments, copies:
+            each.reset()
+            each.step(action)
+        ids, action = np.arange(len(sources)), action[: len(sources)]
+        copies.copy_from(copies, sources, ids)
+        same = np.zeros((3, action.shape[1]))
+        expected, step = environments.step(same), copies.step(same)
+        np.testing.assert_array_equal(step.observation[ids], expected.observation[sources])
+        np.testing.assert_array_equal(step.reward[ids], expected.reward[sources])
+
     @parameterized.parameters(*KINDS)
     def test_single_simulations_can_be_restored(self, id_):
         env_ids, twin = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))

@@ -114,11 +114,13 @@ class Simulations:
         """Copies simulations of the same task, without their random streams and seeds.
 
         Args:
-          other: the other simulations.
-          other_ids: numbers of those to copy.
+          other: the other simulations, or these.
+          other_ids: numbers of those to copy, as they are before the call.
           ids: numbers of as many of these simulations.
         """
-        for source, env_id in zip(other_ids, ids, strict=True):
-            self.task.set_state(env_id, other.task.get_state(source))
-            self.world.set_state(env_id, other.world.get_state(source))
-            self.steps[env_id], self.ended[env_id] = other.steps[source], other.ended[source]
+        # All are read before the first is written, since the simulations may be the same.
+        found = [(other.task.get_state(i), other.world.get_state(i)) for i in other_ids]
+        for env_id, (task, world) in zip(ids, found, strict=True):
+            self.task.set_state(env_id, task)
+            self.world.set_state(env_id, world)
+        self.steps[ids], self.ended[ids] = other.steps[other_ids], other.ended[other_ids]
