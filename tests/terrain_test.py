@@ -1,6 +1,7 @@
 """Tests of trl_suite.terrain: values from the papers and the original's description."""
 
 import copy
+import itertools
 import json
 import math
 import pathlib
@@ -616,14 +617,6 @@ class PlanarGroundTest(parameterized.TestCase):
             with self.assertRaisesRegex(TypeError, 'seed'):
                 ground(seed)
 
-    def test_streams_of_level_ground(self):
-        # They are created on demand; a state includes them.
-        state = terrain.PlanarGround(terrain.load('flat'), 3).state()
-        other = terrain.PlanarGround(terrain.load('slopes'), 3).state()
-        self.assertEqual(state['right'], other['right'])
-        self.assertEqual(state['left'], other['left'])
-        self.assertEqual(state['right'], np.random.PCG64(3).state)
-
     def test_sides_differ(self):
         heights = self.make('slopes').window(-840, 1681)[0]
         self.assertFalse(np.array_equal(heights[:840], heights[:840:-1]))
@@ -658,27 +651,45 @@ class PlanarGroundTest(parameterized.TestCase):
         strip = self.make('slopes_mixed')
         strip.ensure(-30, 50)
         state = pickle.loads(pickle.dumps(strip.state()))
-        ways = [terrain.PlanarGround.from_state(state), pickle.loads(pickle.dumps(strip))]
-        other = self.make('gaps', 9)
-        other.ensure(-60, 60)
-        other.set_state(state)
         expected = strip.window(-4000, 8000)
-        for restored in [*ways, other]:
-            self.assertEqual(restored.extent[0], state['low'] * 0.025)
+        for restored in terrain.PlanarGround.from_state(state), pickle.loads(pickle.dumps(strip)):
             for a, b in zip(restored.window(-4000, 8000), expected, strict=True):
                 np.testing.assert_array_equal(a, b)
-        # The state is no part of the strip it was taken from.
-        self.assertLess(state['heights'].size, 6000)
 
-    def test_an_invalid_state_does_not_change_the_ground(self):
-        strip = self.make()
-        before = strip.height(5.0)
-        state = strip.state()
-        del state['vertical']
-        with self.assertRaises(KeyError):
-            strip.set_state(state)
-        self.assertEqual(strip.height(5.0), before)
-        np.testing.assert_array_equal(strip.height([55.0]), self.make().height([55.0]))
+    @parameterized.parameters(
+        *itertools.product(('slopes_mixed', 'gaps', 'flat', 'wave'), (0, 3, -1, 9000, -9000))
+    )
+    def test_a_state_far_away(self, name, x):
+        """It holds no ground, and is restored where it was, on the way there, and beyond."""
+        if name == 'wave':
+            terrain.from_function(np.sin, name, start_span=5, replace=True)
+        source = terrain.load({'Type': name} if name == 'wave' else name)
+        ground = terrain.PlanarGround(source, 4)
+        near = round(x / 0.025)
+        places = [near, near + 400, near - 400, near + 4000, near - 4000, 0, near]
+        expected = [terrain.PlanarGround(source, 4).window(place, 961) for place in places]
+        for at in range(0, x, 5 if x > 0 else -5):
+            ground.ensure(at - 6, at + 18)
+        ground.window(near, 961)
+        low, high = ground.extent
+        self.assertLess(high - low, 250)
+        state = pickle.dumps(ground.state())
+        self.assertLess(len(state), 2500)
+        for place, heights in zip(places, expected, strict=True):
+            restored = terrain.PlanarGround.from_state(pickle.loads(state))
+            for each in ground, restored:  # the one has forgotten, the other was never there
+                for a, b in zip(each.window(place, 961), heights, strict=True):
+                    np.testing.assert_array_equal(a, b)
+
+    def test_queries_in_any_order(self):
+        """What is forgotten is generated again, before and after states."""
+        rng, ground = np.random.default_rng(0), self.make('slopes_mixed')
+        for place in rng.integers(-40_000, 40_000, 60) // rng.choice((1, 30), 60):
+            found = ground.window(int(place), 961)
+            for a, b in zip(found, self.make('slopes_mixed').window(int(place), 961), strict=True):
+                np.testing.assert_array_equal(a, b)
+            if rng.random() < 0.3:
+                ground = terrain.PlanarGround.from_state(ground.state())
 
     @parameterized.parameters('slopes_mixed', 'cliffs_rugged', 'bumps')
     def test_height_is_linear_interpolation(self, name):

@@ -2,24 +2,51 @@
 
 from __future__ import annotations
 
-import functools
+import copy
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.planar.features import flat
-from trl_suite.terrain.planar.generators import GENERATORS, LONGEST, SPACING, STEEP, cells, draw
-from trl_suite.util.compiled import compiled
+from trl_suite.terrain.planar.generators import (
+    GENERATORS,
+    LONGEST,
+    SPACING,
+    STEEP,
+    Profile,
+    cells,
+    draw,
+)
 
 STRETCH = 20.0  # m; nominal length generated at once; slopes restart in every stretch
+KEPT = 50.0  # m; ground farther from the latest query is forgotten
 PAD_END = 1.0  # m; end of the flat start
 INTENDED_CENTRE = -1.0  # m
+_STRETCH, _KEPT, _PAD_END = (cells(length) for length in (STRETCH, KEPT, PAD_END))
+_NOWHERE = 2**62  # number of no mark
 _UNUSED = np.random.default_rng(0)  # for level ground, which draws nothing
 _FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # distance of two streams: 2**128 / golden ratio draws
+
+
+class Mark(NamedTuple):
+    """Where two stretches meet, and all that the ground beyond depends on.
+
+    Attributes:
+      number: 0 at the centre, 1, 2, ... to the right of it, -1, -2, ... to the left.
+      vertex: its vertex.
+      height: height of that vertex, m.
+      stream: state of the random generator from which the next stretch away from the centre is
+        drawn; None before it is drawn, at the centre, and for level ground.
+    """
+
+    number: int
+    vertex: int
+    height: float
+    stream: dict[str, Any] | None
 
 
 class PlanarGround:
@@ -27,7 +54,8 @@ class PlanarGround:
 
     Vertex i is at x = i * SPACING, for any integer i; the ground is linear in between. Ground to
     the right and ground to the left have separate random streams, so the ground depends on the seed
-    only, not on the order or extent of queries.
+    only, not on the order or extent of queries. Ground far from the latest query is forgotten, and
+    generated again if it is needed: on the way back, from the centre on.
 
     The first two stretches meet at height 0 at the `centre`. A stretch over x = 0 begins with flat
     ground, intended to reach x = +1 (the original's rule). With the centre at -1, as the original
@@ -80,32 +108,50 @@ class PlanarGround:
             raise ValueError(f"spawn must be 'intended' or 'upstream', not {spawn!r}")
         if not abs(centre) <= LONGEST:
             raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
-        self.type = terrain.type
-        self.parameters = terrain.parameters(terrain_level)
-        # Heights of the vertices _low, _low + 1, ...; `_vertical` is for the cells between them.
-        self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
-        self._heights = np.zeros(1)
-        self._vertical = np.zeros(0, dtype=bool)
-        self._sequence = seed_sequence(seed)
-        self._offset = 0.0  # m; argument of the line function at the origin
-        if self._line is not None:
-            self._low = 0
-            span = self.parameters['StartSpan']
-            if span:
-                self._offset = float(np.random.default_rng(self._sequence).uniform(-span, span))
-            self._heights = self._on_line(0, 1)
+        vertex = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
+        self._begin(
+            terrain.type, terrain.parameters(terrain_level), seed_sequence(seed),
+            Mark(0, vertex, 0.0, None),
+        )  # fmt: skip
 
-    @functools.cached_property
-    def _streams(self) -> tuple[np.random.Generator, np.random.Generator]:
-        """Random generators of the ground to the right and to the left."""
-        # Two distant parts of one stream; `jumped` would needlessly draw a seed from the system.
-        right, left = np.random.PCG64(self._sequence), np.random.PCG64(self._sequence)
-        left.advance(_FAR)
-        return np.random.Generator(right), np.random.Generator(left)
+    def _begin(
+        self, type_: str, parameters: Mapping[str, float], sequence: np.random.SeedSequence,
+        centre: Mark,
+    ) -> None:  # fmt: skip
+        self.type: str = type_
+        self.parameters: dict[str, float] = dict(parameters)
+        self._sequence, self._centre = sequence, centre
+        # Random streams of the ground to the right and to the left, created on demand, and the numbers
+        # of the marks from which they draw next.
+        self._streams: list[np.random.Generator | None] = [None, None]
+        self._at = [0, 0]
+        self._offset = 0.0  # m; argument of the line function at the origin
+        span = self.parameters['StartSpan'] if self._line is not None else 0.0
+        if span:
+            self._offset = float(np.random.default_rng(sequence).uniform(-span, span))
+        self._start(centre)
+        if self._line is not None:
+            self._low, self._heights = 0, self._on_line(0, 1)
+
+    def _start(self, mark: Mark) -> None:
+        """Forgets all ground; what is queried next is generated from a mark on."""
+        # Stretch k, heights without the last one and vertical faces, is between marks k and k + 1.
+        self._marks = [mark]
+        self._stretches: list[tuple[np.ndarray, np.ndarray]] = []
+        self._low, self._heights = mark.vertex, np.array([mark.height])
+        self._vertical = np.zeros(0, bool)
+
+    def _join(self) -> None:
+        """Joins the stretches: `_heights` of the vertices `_low`, `_low` + 1, ..., and faces."""
+        self._low = self._marks[0].vertex
+        self._heights = np.concatenate(
+            [*(heights for heights, _ in self._stretches), [self._marks[-1].height]]
+        )
+        self._vertical = np.concatenate([vertical for _, vertical in self._stretches])
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Lowest and highest x of the ground that exists so far, m."""
+        """Lowest and highest x of the ground that is held in memory, m."""
         return self._low * SPACING, (self._low + len(self._heights) - 1) * SPACING
 
     def ensure(self, lo: float, hi: float) -> None:
@@ -153,34 +199,38 @@ class PlanarGround:
         return self._cell(x)[1] / SPACING
 
     def state(self) -> dict[str, Any]:
-        """Returns a state from which `from_state` continues exactly as this ground would."""
+        """Returns a state from which `from_state` continues exactly as this ground would.
+
+        It has the seed, not the ground; and, far from the centre, a mark near the latest query, so
+        that the ground there need not be generated from the centre on.
+        """
+        first, last = self._marks[0], self._marks[-1]
+        mark = first if first.number > 0 else last if last.number < 0 else None
         return {
             'type': self.type,
             'parameters': dict(self.parameters),
-            'low': self._low,
-            'heights': self._heights.copy(),
-            'vertical': self._vertical.copy(),
-            'right': self._streams[0].bit_generator.state,
-            'left': self._streams[1].bit_generator.state,
-            'offset': self._offset,
+            'entropy': copy.copy(self._sequence.entropy),
+            'spawn_key': tuple(self._sequence.spawn_key),
+            'centre': self._centre.vertex,
+            'mark': None if mark is None else tuple(copy.deepcopy(mark)),
         }
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> PlanarGround:
         """Returns the ground that had this `state`."""
-        strip = cls.__new__(cls)
-        strip.set_state(state)
-        return strip
+        ground = cls.__new__(cls)
+        ground.__setstate__(state)
+        return ground
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restores the ground to the time at which `state` was taken."""
-        right, left = np.random.default_rng(0), np.random.default_rng(0)
-        right.bit_generator.state, left.bit_generator.state = state['right'], state['left']
-        self.type, self.parameters = state['type'], dict(state['parameters'])
-        self._low = state['low']
-        self._heights, self._vertical = state['heights'].copy(), state['vertical'].copy()
-        self._streams = right, left
-        self._offset = state.get('offset', 0.0)
+    def __getstate__(self) -> dict[str, Any]:
+        return self.state()
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
+        centre = Mark(0, state['centre'], 0.0, None)
+        self._begin(state['type'], state['parameters'], sequence, centre)
+        if state['mark'] is not None:
+            self._start(Mark(*state['mark']))
 
     @property
     def _line(self) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -222,96 +272,77 @@ class PlanarGround:
         return left, self._heights[i + 1] - left, position - number
 
     def _extend(self, low: int, high: int) -> None:
-        """Generates stretches until the vertices from low to high exist."""
-        end = self._low + len(self._heights) - 1
+        """Generates stretches until the vertices from low to high exist; forgets those far away."""
+        if self._low <= low and high < self._low + len(self._heights):
+            return
         if self._line is not None:
-            self._extend_line(min(low, self._low), max(high, end))
+            heights = self._on_line(low - _STRETCH, high - low + 2 * _STRETCH + 1)
+            self._low, self._heights = low - _STRETCH, heights
+            self._vertical = np.abs(np.diff(heights)) > STEEP * SPACING
             return
-        start, right, left = self._low, [], []
-        while end < high:
-            right.append(self._stretch(end, 0))
-            end += right[-1][0] + len(right[-1][1])
-        while start > low:
-            left.append(self._stretch(start - cells(STRETCH), 1))
-            start -= left[-1][0] + len(left[-1][1])
-        if not (right or left):
-            return
-        heights, vertical = np.empty(end - start + 1), np.empty(end - start, bool)
-        first, last = self._low - start, self._low - start + len(self._vertical)
-        heights[first : last + 1], vertical[first:last] = self._heights, self._vertical
-        for stretch in right:
-            last = _append(last, *stretch, heights, vertical)
-        for stretch in left:
-            first = _prepend(first, *stretch, heights, vertical)
-        self._low, self._heights, self._vertical = start, heights, vertical
+        marks = self._marks
+        if (low < marks[0].vertex and marks[0].number > 0) or (
+            high > marks[-1].vertex and marks[-1].number < 0
+        ):  # forgotten
+            self._start(self._centre)
+            marks = self._marks
+        while marks[-1].vertex < high:
+            self._append(right=True)
+            while len(marks) > 1 and marks[1].vertex < low - _KEPT:
+                del marks[0], self._stretches[0]
+        while marks[0].vertex > low:
+            self._append(right=False)
+            while len(marks) > 1 and marks[-2].vertex > high + _KEPT:
+                del marks[-1], self._stretches[-1]
+        self._join()
 
-    def _extend_line(self, low: int, high: int) -> None:
-        """Adds missing vertices from low to high, and a margin, from the line function."""
-        end, more = self._low + len(self._heights) - 1, cells(STRETCH)
-        parts = [self._heights]
-        if low < self._low:
-            parts.insert(0, self._on_line(low - more, self._low - low + more))
-            self._low = low - more
-        if high > end:
-            parts.append(self._on_line(end + 1, high - end + more))
-        if len(parts) > 1:
-            self._heights = np.concatenate(parts)
-            self._vertical = np.abs(np.diff(self._heights)) > STEEP * SPACING
+    def _append(self, right: bool) -> None:
+        """Generates the next stretch to the right or to the left."""
+        mark, profile = self._marks[-1 if right else 0], self._draw(right)
+        count, begin = len(profile.heights), mark.vertex if right else mark.vertex - _STRETCH
+        pad = 0  # level vertices at the beginning of a stretch over x = 0
+        if begin <= 0 < begin + _STRETCH:
+            pad = min(_STRETCH, _PAD_END - begin)
+        start, end = mark.height, float(profile.heights[-1])
+        heights, rises, vertical = np.empty(pad + count), profile.heights[:-1], profile.vertical
+        if not right:
+            start, rises = -end + mark.height, rises - end
+        heights[: pad + 1] = start
+        np.add(rises, mark.height, out=heights[pad + 1 :])
+        if pad:
+            vertical = np.concatenate([np.zeros(pad, bool), vertical])
+        if right:
+            self._marks.append(Mark(mark.number + 1, mark.vertex + pad + count, start + end, None))
+            self._stretches.append((heights, vertical))
+        else:
+            self._marks.insert(0, Mark(mark.number - 1, mark.vertex - pad - count, start, None))
+            self._stretches.insert(0, (heights, vertical))
 
-    def _stretch(self, begin: int, side: int) -> tuple[int, np.ndarray, np.ndarray]:
-        """Generates a stretch that begins at a vertex.
-
-        Returns:
-          The number of level vertices at its beginning (not 0 only if it covers x = 0), and heights
-          and vertical faces of the vertices that follow, as in a `Profile`.
-        """
+    def _draw(self, right: bool) -> Profile:
+        """Generates the profile of the next stretch to the right or to the left."""
         generator = GENERATORS.get(self.type)
         if generator is not None and generator.function is flat:
             # Not from the streams: creating them takes longer than generating the ground.
-            profile = flat(self.parameters, STRETCH, _UNUSED)
-        else:
-            profile = draw(self.type, self.parameters, STRETCH, self._streams[side])
-        pad = 0
-        if begin <= 0 < begin + cells(STRETCH):
-            pad = min(cells(STRETCH), cells(PAD_END) - begin)
-        return pad, profile.heights, profile.vertical
-
-
-@compiled
-def _append(
-    last: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
-    vertical: np.ndarray,
-) -> int:  # fmt: skip
-    """Writes a stretch after the last vertex; returns the index of the new last vertex."""
-    base = heights[last]
-    for k in range(pad):
-        heights[last + 1 + k], vertical[last + k] = base, False
-    last += pad
-    for k in range(len(more)):
-        heights[last + 1 + k], vertical[last + k] = base + more[k], faces[k]
-    return last + len(more)
-
-
-@compiled
-def _prepend(
-    first: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
-    vertical: np.ndarray,
-) -> int:  # fmt: skip
-    """Writes a stretch before the first vertex, with which its last vertex coincides.
-
-    Its start, at relative height 0, becomes the new first vertex; returns the index of that vertex.
-    """
-    height, end = heights[first], more[-1]
-    first -= pad + len(more)
-    for k in range(pad + 1):
-        heights[first + k] = -end + height
-    for k in range(pad):
-        vertical[first + k] = False
-    for k in range(len(more) - 1):
-        heights[first + pad + 1 + k] = more[k] - end + height
-    for k in range(len(more)):
-        vertical[first + pad + k] = faces[k]
-    return first
+            return flat(self.parameters, STRETCH, _UNUSED)
+        last, side = (-1, 0) if right else (0, 1)
+        mark = self._marks[last]
+        random = self._streams[side]
+        if random is None or (mark.number == 0 and self._at[side] != 0):
+            # Two distant parts of one stream; `jumped` would needlessly draw a seed from the system.
+            start = np.random.PCG64(self._sequence)
+            random = self._streams[side] = np.random.Generator(
+                start if right else start.advance(_FAR)
+            )
+            self._at[side] = 0
+        bits: Any = random.bit_generator
+        if self._at[side] != mark.number:
+            bits.state = mark.stream
+        elif mark.number != 0:
+            self._marks[last] = mark._replace(stream=bits.state)
+        self._at[side] = _NOWHERE
+        profile = draw(self.type, self.parameters, STRETCH, random)
+        self._at[side] = mark.number + (1 if right else -1)
+        return profile
 
 
 def seed_sequence(

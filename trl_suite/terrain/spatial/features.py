@@ -22,6 +22,7 @@ from trl_suite.terrain.spatial.trail import AMPLITUDE, FREQUENCY, Trail
 from trl_suite.util.compiled import compiled
 
 TILE = 80.0  # m; side of the squares in which obstacles are drawn; one is centred on the origin
+TILES = 64  # squares held in memory
 CLEAR = 2.0  # m; half side of the square about the origin that obstacles leave clear
 DENSE = 0.25  # 1/m^2; denser obstacles form a height grid, in which later ones overwrite earlier
 FAR = 1e3  # m; where unbounded boxes end
@@ -250,6 +251,8 @@ class _Obstacles:
 
     def _tile(self, tile: tuple[int, int]) -> Rectangles:
         if tile not in self._tiles:
+            if len(self._tiles) == TILES:
+                del self._tiles[next(iter(self._tiles))]
             parameters = self._parameters
             # Indices of squares as natural numbers: 0, 1, -1, 2, ... -> 0, 2, 1, 4, ...
             naturals = [2 * k if k >= 0 else -2 * k - 1 for k in tile]

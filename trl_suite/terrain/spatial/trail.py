@@ -48,8 +48,9 @@ class Trail:
         first, second = parameters['PathWidth0'], parameters['PathWidth1']
         self._narrowest, self._widest = min(first, second), max(first, second)
         width = self._narrowest + (self._widest - self._narrowest) * rng.random()
-        # Of each segment: start, heading, width, height.
-        self._segments: list[tuple[float, float, float, float, float]] = []
+        # Of each segment: start (2), heading, width, height.
+        self._segments = np.zeros((0, 5))
+        self._added: list[tuple[float, float, float, float, float]] = []
         self._tip = (*BEGIN, 0.0, width, parameters['PathHeight0'])
         for _ in range(STRAIGHT):
             self._append()
@@ -57,19 +58,17 @@ class Trail:
 
     def extend(self, count: int) -> None:
         """Extends the trail to at least `count` segments."""
-        if count > len(self._segments):
-            while len(self._segments) < min(count, MOST):
-                self._turn()
-                self._append()
-            self._arrays()
+        for _ in range(min(count, MOST) - len(self._segments)):
+            self._turn()
+            self._append()
+        self._arrays()
 
     def reach(self, x: float) -> None:
         """Extends the trail so far that further segments do not return to x m or less."""
-        if self._tip[0] < x + MARGIN:
-            while self._tip[0] < x + MARGIN and len(self._segments) < MOST:
-                self._turn()
-                self._append()
-            self._arrays()
+        while self._tip[0] < x + MARGIN and len(self._segments) + len(self._added) < MOST:
+            self._turn()
+            self._append()
+        self._arrays()
 
     def leave(self, half_side: float) -> int:
         """Returns the number of segments up to the first that ends outside a square at the origin."""
@@ -97,7 +96,7 @@ class Trail:
         for (a, c), (b, d), k in zip(
             low[crossing].tolist(), high[crossing].tolist(), crossing.tolist(), strict=True
         ):
-            x0, y0, heading, width, height = self._segments[k]
+            x0, y0, heading, width, height = self._segments[k].tolist()
             cosine, sine = math.cos(heading), math.sin(heading)
             x, y = columns[a:b] - x0, rows[c:d] - y0
             along = x * cosine + y * sine
@@ -131,13 +130,16 @@ class Trail:
 
     def _append(self) -> None:
         """Appends the segment that starts at the tip."""
-        self._segments.append(self._tip)
+        self._added.append(self._tip)
         x, y, heading, width, height = self._tip
         x, y = x + SEGMENT * math.cos(heading), y + SEGMENT * math.sin(heading)
         self._tip = (x, y, heading, width, height)
 
     def _arrays(self) -> None:
-        segments = np.array(self._segments)
+        if not self._added:
+            return
+        self._segments = segments = np.concatenate([self._segments, self._added])
+        self._added = []
         self.start, self.heading = segments[:, :2], segments[:, 2]
         self.width, self.height = segments[:, 3], segments[:, 4]
         direction = np.stack([np.cos(self.heading), np.sin(self.heading)], 1)
