@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
+from trl_suite.environments import states
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE, SUBSTEPS
 from trl_suite.tasks.gait.task import GaitTask
@@ -177,7 +178,7 @@ def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray)
     qpos = world[1 : 1 + copies.task.world.qpos.shape[1]]  # time precedes the positions
     joints = np.delete(np.arange(len(qpos)), copies.task.figure.pose_qpos[:3])
     qpos[joints] += change
-    return {**state, 'world': [world]}
+    return states.seal({**state, 'world': [world]})
 
 
 def vector_of(gait: Parameters, start: str | None) -> np.ndarray:

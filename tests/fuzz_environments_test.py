@@ -19,6 +19,7 @@ from hypothesis import stateful
 from hypothesis import strategies as st
 
 from trl_suite import suite
+from trl_suite.environments import states
 from trl_suite.registry import catalogue
 from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.tasks.disturbances import sensors, worlds
@@ -35,6 +36,11 @@ SPECS = {
 }  # one of each task type
 IDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+REALISTIC = {
+    'actuators': {'strength': (0.7, 1.3), 'delay': (0, 2), 'noise': 0.05},
+    'randomize': {'preset': 'robot', 'push': {'speed': (0.2, 1), 'interval': (0, 0.3)}},
+    'sensors': {'preset': 'robot', 'delay': (0, 3)},
+}
 REFUSALS = (ValueError, TypeError)
 
 numbers = st.one_of(
@@ -70,13 +76,15 @@ def drawn(test, examples):
 
 
 @functools.cache
-def pair(id_):
-    """Two simulations, and a single environment for each, which begin again with new seeds."""
-    return VectorEnvironment(id_, 2, 1, seed=0), [suite.make(id_) for _ in range(2)]
+def several(id_, realistic, count):
+    """Simulations, and a single environment for each, which begin again with new seeds."""
+    options = REALISTIC if realistic else {}
+    environments = VectorEnvironment(id_, count, 1, seed=0, task_kwargs=options)
+    return environments, [suite.make(id_, options) for _ in range(count)]
 
 
-def begun(id_, seed=0):
-    environments, singles = pair(id_)
+def begun(id_, seed=0, realistic=False, count=2):
+    environments, singles = several(id_, realistic, count)
     first = environments.reset(seed=seed)
     for single, own, observation in zip(singles, environments.seeds, first, strict=True):
         single.random_state.seed(own)
@@ -201,7 +209,7 @@ def state_test(id_):
                 value = data.draw(st.floats(allow_nan=True, allow_infinity=True))
                 world = np.array(state['world'])
                 world[..., data.draw(st.integers(0, world.shape[-1] - 1))] = value
-                state['world'] = world
+                state = states.seal({**state, 'world': world})  # otherwise it is refused as damaged
             elif key is None:
                 state = data.draw(anything)
             elif key in ('task', 'fresh') or data.draw(st.booleans()):
@@ -225,21 +233,53 @@ def state_test(id_):
     return test
 
 
-class Calls(stateful.RuleBasedStateMachine):
-    """Two simulations and two single environments are told the same, and do the same."""
+VARIANTS = st.fixed_dictionaries({}, optional={
+    'actuators': st.fixed_dictionaries({'noise': st.sampled_from((0.05, 0.1))}),
+    'sensors': st.fixed_dictionaries({'delay': st.integers(1, 2)}),
+    'randomize': st.sampled_from(({'preset': 'robot'}, {'push': REALISTIC['randomize']['push']})),
+})  # fmt: skip
 
-    ID = GAPS
-    which = st.integers(0, 1)
+
+def across_test(id_):
+    """A state is restored by environments with equal options, and refused by others."""
+
+    @hypothesis.given(VARIANTS, st.one_of(VARIANTS, st.none()))
+    def test(options, others):
+        others = options if others is None else others
+        one, other = (suite.make(id_, {**each, 'random': 0}) for each in (options, others))
+        action = np.zeros(len(one.action_map))
+        one.reset()
+        one.step(action)
+        state, before = one.get_state(), pickle.dumps(other.get_state())
+        if options == others:
+            other.set_state(pickle.loads(pickle.dumps(state)))
+            np.testing.assert_array_equal(flat(one.step(action)), flat(other.step(action)))
+        else:
+            with pytest.raises(ValueError, match='belongs to another environment'):
+                other.set_state(state)
+            assert pickle.dumps(other.get_state()) == before
+        one.close()
+        other.close()
+
+    return test
+
+
+class Calls(stateful.RuleBasedStateMachine):
+    """Some simulations and as many single environments are told the same, and do the same."""
+
+    ID, REALISTIC, COUNT = GAPS, False, 3
+    which = st.integers(0, COUNT - 1)
+    copies = st.lists(st.tuples(which, which), max_size=COUNT, unique_by=lambda pair: pair[1])
     states = stateful.Bundle('states')
 
     @stateful.initialize(seed=st.integers(0, 2**32 - 1))
     def begin(self, seed):
-        self.environments, self.singles = begun(self.ID, seed)
+        self.environments, self.singles = begun(self.ID, seed, self.REALISTIC, self.COUNT)
         self.size = len(self.environments.action_map)
 
     @stateful.rule(seed=st.integers(0, 9), scale=st.sampled_from((0.0, 0.3, 1.0, 1e9)))
     def step(self, seed, scale):
-        action = scale * np.random.default_rng(seed).uniform(-1, 1, (2, self.size))
+        action = scale * np.random.default_rng(seed).uniform(-1, 1, (self.COUNT, self.size))
         found = self.environments.step(action)
         assert np.isfinite(found.observation).all()
         for i, single in enumerate(self.singles):
@@ -266,12 +306,14 @@ class Calls(stateful.RuleBasedStateMachine):
         for single, own in zip(self.singles, alone, strict=True):
             single.set_state(own)
 
-    @stateful.rule(i=which, j=which)
-    def copy(self, i, j):
-        self.environments.copy_from(self.environments, [i], [j])
-        state = self.singles[i].get_state()
-        state['random'] = self.singles[j].random_state.get_state()
-        self.singles[j].set_state(state)
+    @stateful.rule(pairs=copies)
+    def copy(self, pairs):
+        found = [single.get_state() for single in self.singles]
+        for i, j in pairs:
+            self.singles[j].set_state(
+                states.seal({**found[i], 'random': self.singles[j].random_state.get_state()})
+            )
+        self.environments.copy_from(self.environments, [i for i, _ in pairs], [j for _, j in pairs])
 
     @stateful.rule(i=which)
     def break_down(self, i):
@@ -296,9 +338,10 @@ class Reopened(Calls):
     def make_again(self):
         state, old = self.environments.get_state(), (self.environments, *self.singles)
         self.singles = [pickle.loads(pickle.dumps(single)) for single in self.singles]
-        self.environments = VectorEnvironment(self.ID, 2, 1, seed=3)
+        options = REALISTIC if self.REALISTIC else {}
+        self.environments = VectorEnvironment(self.ID, self.COUNT, 1, seed=3, task_kwargs=options)
         self.environments.set_state(state)
-        if old[0] is not pair(self.ID)[0]:
+        if old[0] is not several(self.ID, self.REALISTIC, self.COUNT)[0]:
             for each in old:
                 each.close()
                 for call in (each.reset, each.get_state):
@@ -306,9 +349,10 @@ class Reopened(Calls):
                         call()
 
 
-def machine(kind, id_, examples, steps, seed):
+def machine(kind, id_, examples, steps, seed, realistic=False):
     settings = hypothesis.settings(max_examples=examples, stateful_step_count=steps, **COMMON)
-    calls = hypothesis.seed(seed)(type(f'{kind.__name__}Of', (kind,), {'ID': id_}))
+    names = {'ID': id_, 'REALISTIC': realistic}
+    calls = hypothesis.seed(seed)(type(f'{kind.__name__}Of', (kind,), names))
     stateful.run_state_machine_as_test(calls, settings=settings)
 
 
@@ -328,7 +372,11 @@ class FastTest(parameterized.TestCase):
 
     def test_calls(self):
         machine(Calls, GAPS, 4, 20, 0)
+        machine(Calls, GAPS, 2, 20, 0, realistic=True)
         machine(Reopened, GAPS, 1, 10, 1)
+
+    def test_states_across_options(self):
+        many(across_test(GAPS), 6)
 
 
 @pytest.mark.slow
@@ -350,10 +398,14 @@ class SlowTest(parameterized.TestCase):
         drawn(state_test(id_), SLOW)
 
     @parameterized.parameters(*IDS)
-    def test_calls(self, id_):
+    def test_states_across_options(self, id_):
+        drawn(across_test(id_), max(1, SLOW // 10))
+
+    @parameterized.product(id_=IDS, realistic=(False, True))
+    def test_calls(self, id_, realistic):
         seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
         print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={SLOW}')
-        machine(Reopened, id_, max(1, SLOW // 10), 30, seed)
+        machine(Reopened, id_, max(1, SLOW // 10), 30, seed, realistic)
 
 
 if __name__ == '__main__':

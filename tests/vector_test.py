@@ -352,9 +352,7 @@ class PartialBatchTest(parameterized.TestCase):
             environments.set_state(state, [1])
         environments.reset()
         for numbers in ([0, 1], None, []):
-            with self.assertRaisesRegex(
-                ValueError, "the state has 1 simulations in 'world'; expected"
-            ):
+            with self.assertRaisesRegex(ValueError, 'the state has 1 simulations; expected'):
                 environments.set_state(state, numbers)
         with self.assertRaisesRegex(ValueError, 'each of 2 simulations once'):
             environments.set_state(environments.get_state([1, 2]), [1, 1])
@@ -395,9 +393,9 @@ class PartialBatchTest(parameterized.TestCase):
         single = suite.make(FLAT)
         single.reset()
         for state in (other.get_state(), {}, single.get_state()):
-            with self.assertRaisesRegex(ValueError, 'the state belongs to .*; this environment is'):
+            with self.assertRaisesRegex(ValueError, 'the state belongs to another environment: '):
                 environments.set_state(state)
-        with self.assertRaisesRegex(ValueError, 'the state belongs to simulations of'):
+        with self.assertRaisesRegex(ValueError, 'another environment: environment vector'):
             single.set_state(environments.get_state())
         for state in (None, [], 3):
             for each in environments, single:
@@ -405,37 +403,9 @@ class PartialBatchTest(parameterized.TestCase):
                     each.set_state(state)
         partial = environments.get_state()
         del partial['ended']
-        with self.assertRaisesRegex(ValueError, "the state lacks 'ended'"):
+        with self.assertRaisesRegex(ValueError, 'its checksum differs'):
             environments.set_state(partial)
         self.assertEqual(pickle.dumps(environments.get_state()), before)
-
-    def test_entries_of_a_state_of_another_type_or_shape(self):
-        """The environment keeps its own state."""
-        environments = VectorEnvironment(FLAT, 2, 1, 0)
-        single = suite.make(FLAT, {'random': 0})
-        for each, names in (
-            (environments, ('world', 'task', 'random', 'seeds', 'steps', 'ended', 'fresh')),
-            (single, ('world', 'task', 'random', 'steps', 'reset_next_step')),
-        ):
-            each.reset()
-            state, before = each.get_state(), pickle.dumps(each.get_state())
-            for name in names:
-                for value in (
-                    None,
-                    3.5,
-                    'x',
-                    [],
-                    [1.5],
-                    ['x', 'y'],
-                    [[1], [2, 3]],
-                    np.ones((2, 3)),
-                ):
-                    with (
-                        self.subTest(name, value=value),
-                        self.assertRaisesRegex(ValueError, f"the state has .*'{name}'"),
-                    ):
-                        each.set_state({**state, name: value})
-                    self.assertEqual(pickle.dumps(each.get_state()), before)
 
     def test_options_that_are_arrays(self):
         options = [{'start_phase': np.array([[0.0, high]])} for high in (0.5, 0.5, 0.6)]
@@ -444,7 +414,7 @@ class PartialBatchTest(parameterized.TestCase):
             each.reset()
         one.copy_from(same, [0], [1])
         np.testing.assert_array_equal(one.task.world.qpos[1], same.task.world.qpos[0])
-        with self.assertRaisesRegex(ValueError, 'id or options differ'):
+        with self.assertRaisesRegex(ValueError, 'options PlanarImitationConfig .* instead of'):
             one.copy_from(other, [0], [1])
         with self.assertRaisesRegex(TypeError, 'other is Environment; expected VectorEnvironment'):
             one.copy_from(suite.make(FLAT), [0], [1])

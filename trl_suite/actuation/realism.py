@@ -116,15 +116,6 @@ class Actuators(Config):
             if not getattr(self, needed) and name in self.changed:
                 raise ValueError(f'{name} has no effect without {needed}; give both or none')
 
-    @property
-    def changed(self) -> dict[str, Any]:
-        """The options that differ from the defaults, by name."""
-        return {
-            field.name: getattr(self, field.name)
-            for field in dataclasses.fields(self)
-            if getattr(self, field.name) != field.default
-        }
-
     @classmethod
     def parse(cls, value: Any) -> Actuators:
         """Returns the actuators that a user gives: options by name, or `Actuators`.

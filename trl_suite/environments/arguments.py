@@ -1,9 +1,9 @@
-"""Checks of the arguments of environments: limits, simulations, seeds, saved states, threads."""
+"""Checks of the arguments of environments: limits, simulations, seeds, threads."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -137,76 +137,3 @@ def _seeds(seed: Sequence[int], num_envs: int) -> np.ndarray:
     if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
         raise ValueError(f'seed is {seed!r}; expected an integer in [0, 2**32) for each simulation')
     return seeds
-
-
-def check_state(state: Any, owner: str, keys: Iterable[str]) -> None:
-    """Checks that a saved state was made by an environment like this one.
-
-    Args:
-      state: the state to check.
-      owner: the value of 'made_for' in a state of this environment.
-      keys: the other keys of such a state.
-
-    Raises:
-      TypeError: the state is not a mapping.
-      ValueError: it belongs to another environment, or parts of it are missing.
-    """
-    if not isinstance(state, Mapping):
-        raise TypeError(f'a state is a dict from get_state, not {type(state).__name__}')
-    found = state.get('made_for')
-    if found != owner:
-        raise ValueError(f'the state belongs to {found}; this environment is {owner}')
-    missing = [key for key in keys if key not in state]
-    if missing:
-        raise ValueError(f'the state lacks {", ".join(map(repr, missing))}')
-
-
-def check_saved(name: str, value: Any, kinds: str, shape: tuple[int, ...]) -> None:
-    """Checks an entry of a saved state.
-
-    Args:
-      name: its key, for the message.
-      value: number, bool, or array.
-      kinds: the allowed kinds of its dtype.
-      shape: its shape.
-
-    Raises:
-      ValueError: it has another type or shape.
-    """
-    try:
-        found = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind not in kinds or found.shape != shape:
-        what = 'bool' if kinds == 'b' else 'whole numbers' if 'f' not in kinds else 'numbers'
-        raise ValueError(
-            f'the state has {name!r} of type {found.dtype} and shape {found.shape}; expected {what} '
-            f'of shape {shape}'
-        )
-
-
-def check_task(value: Any) -> None:
-    """Checks that the saved state of a task is a mapping.
-
-    Raises:
-      ValueError: it is something else.
-    """
-    if not isinstance(value, Mapping):
-        raise ValueError(f"the state has 'task' of type {type(value).__name__}; expected a dict")
-
-
-def check_random(value: Any) -> None:
-    """Checks a saved random stream.
-
-    Raises:
-      ValueError: it is not what `numpy.random.RandomState.get_state` returns.
-    """
-    try:
-        _SCRATCH.set_state(value)
-    except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise ValueError(
-            f"the state has 'random' that is no state of numpy.random.RandomState: {error}"
-        ) from None
-
-
-_SCRATCH = np.random.RandomState(0)

@@ -11,13 +11,12 @@ from dm_control import composer
 from dm_control.composer import observation as composer_observation
 from dm_env import specs
 
-from trl_suite.environments import arguments
+from trl_suite.environments import arguments, states
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors, interrupts
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
-_STATE = ('world', 'task', 'random', 'steps', 'reset_next_step')
 _NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
 
 
@@ -81,6 +80,7 @@ class Environment(composer.Environment):
         # The model is compiled already. Otherwise, composer would compile it again at the first
         # reset.
         self._mjcf_never_compiled = False
+        self._signature = states.signature(task, 'single environment')
         self._parts = tuple(task.blocks.items())
         self._action_map = task.action_map
         # Whether there are hooks to call before or after a step. Checking them takes time.
@@ -255,35 +255,29 @@ class Environment(composer.Environment):
         """
         with self.one_thread:
             self._check_open()
-            return {
-                'made_for': self._task.signature,
+            return states.seal({
+                'made_for': dict(self._signature),
                 'world': self._task.world.get_state(0),
                 'task': self._task.get_state(0),
                 'random': self._random_state.get_state(),
                 'steps': self._steps,
                 'reset_next_step': self._reset_next_step,
-            }
+            })  # fmt: skip
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the same actions then give bit-identical results.
 
         Raises:
           TypeError: the state is not a dict.
-          ValueError: the state belongs to another environment, or an entry has another type or
-            shape; this environment is unchanged. The contents of 'task' are not checked.
+          ValueError: the state belongs to an environment with other contents, such as another
+            ground, or was changed after `get_state`; this environment is unchanged.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
         with self.one_thread:
             self._check_open()
-            arguments.check_state(state, self._task.signature, _STATE)
-            world = self._task.world
-            arguments.check_saved('world', state['world'], 'f', (world.state_size,))
-            arguments.check_saved('steps', state['steps'], 'iu', ())
-            arguments.check_saved('reset_next_step', state['reset_next_step'], 'b', ())
-            arguments.check_random(state['random'])
-            arguments.check_task(state['task'])
+            states.check(state, self._signature)
             self._task.set_state(0, state['task'])
-            world.set_state(0, state['world'])
+            self._task.world.set_state(0, state['world'])
             self._random_state.set_state(state['random'])
             self._steps = state['steps']
             self._reset_next_step = state['reset_next_step']

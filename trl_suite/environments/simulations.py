@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite.engine import BatchWorld, light_model
-from trl_suite.environments import arguments
+from trl_suite.environments import states
 from trl_suite.tasks.task import Task
-
-_STATE = ('world', 'task', 'random', 'seeds', 'steps', 'ended', 'fresh')
 
 
 class Simulations:
@@ -24,6 +21,7 @@ class Simulations:
       steps: control steps since the beginning of the episode, (n,).
       ended: whether the episode has ended, so that a reset is needed, (n,) bool.
       fresh: whether no simulation was ever reset.
+      signature: of saved states, see `states`.
     """
 
     def __init__(self, task: Task, n: int, num_threads: int) -> None:
@@ -37,6 +35,7 @@ class Simulations:
         model = light_model(task.root_entity.mjcf_model)
         self.task, self.world = task, BatchWorld(model, n, num_threads, task.fields)
         task.bind(self.world)
+        self.signature = states.signature(task, 'vector environment')
         self.seeds = np.zeros(n, np.uint32)
         self.steps, self.ended, self.fresh = np.zeros(n, int), np.ones(n, bool), True
         self._random = [np.random.RandomState(0)] * n
@@ -60,15 +59,10 @@ class Simulations:
         self.steps[env_ids] = 0
         self.ended[env_ids] = False
 
-    @property
-    def _owner(self) -> str:
-        """The value of 'made_for' in states of these simulations."""
-        return f'simulations of {self.task.signature}'
-
     def get_state(self, ids: list[int]) -> dict[str, Any]:
         """Returns the complete state of some simulations."""
-        return {
-            'made_for': self._owner,
+        return states.seal({
+            'made_for': dict(self.signature),
             'world': [self.world.get_state(env_id) for env_id in ids],
             'task': [self.task.get_state(env_id) for env_id in ids],
             'random': [self._random[env_id].get_state() for env_id in ids],
@@ -76,7 +70,7 @@ class Simulations:
             'steps': self.steps[ids],
             'ended': self.ended[ids],
             'fresh': self.fresh,
-        }
+        })  # fmt: skip
 
     def set_state(self, state: dict[str, Any], ids: list[int]) -> None:
         """Restores the state of some simulations, except `fresh`.
@@ -84,31 +78,19 @@ class Simulations:
         Raises:
           TypeError, ValueError: see `VectorEnvironment.set_state`; nothing is changed.
         """
-        self._check_state(state, ids)
+        states.check(state, self.signature)
+        if len(state['world']) != len(ids):
+            raise ValueError(
+                f'the state has {len(state["world"])} simulations; expected {len(ids)}'
+            )
+        if len(set(ids)) != len(ids):
+            raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
         for i, env_id in enumerate(ids):
             self.task.set_state(env_id, state['task'][i])
             self.world.set_state(env_id, state['world'][i])
             self._random[env_id].set_state(state['random'][i])
         self.seeds[ids] = state['seeds']
         self.steps[ids], self.ended[ids] = state['steps'], state['ended']
-
-    def _check_state(self, state: dict[str, Any], ids: list[int]) -> None:
-        arguments.check_state(state, self._owner, _STATE)
-        for name in ('world', 'task', 'random'):
-            if not isinstance(state[name], Sequence) or len(state[name]) != len(ids):
-                found = len(state[name]) if isinstance(state[name], Sequence) else 'no'
-                raise ValueError(
-                    f'the state has {found} simulations in {name!r}; expected {len(ids)}'
-                )
-        if len(set(ids)) != len(ids):
-            raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
-        for name, kinds in (('seeds', 'iu'), ('steps', 'iu'), ('ended', 'b')):
-            arguments.check_saved(name, state[name], kinds, (len(ids),))
-        arguments.check_saved('fresh', state['fresh'], 'b', ())
-        for i in range(len(ids)):
-            arguments.check_saved('world', state['world'][i], 'f', (self.world.state_size,))
-            arguments.check_random(state['random'][i])
-            arguments.check_task(state['task'][i])
 
     def copy_from(self, other: Simulations, other_ids: list[int], ids: list[int]) -> None:
         """Copies simulations of the same task, without their random streams and seeds.

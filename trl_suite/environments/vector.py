@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from trl_suite import rendering
-from trl_suite.environments import arguments
+from trl_suite.environments import arguments, states
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.simulations import Simulations
 from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
-from trl_suite.util.options import equal
 
 MOST_ENVS = 2**20  # simulations of one batch
 MOST_THREADS = 4096
@@ -306,9 +305,9 @@ class VectorEnvironment:
 
         Raises:
           TypeError: the state is not a dict.
-          ValueError: the state belongs to another environment or has another number of
-            simulations, an entry has another type or shape, or `env_ids` is invalid; this
-            environment is unchanged. The contents of 'task' are not checked.
+          ValueError: the state belongs to an environment with other contents, such as another
+            ground, has another number of simulations, or was changed after `get_state`, or
+            `env_ids` is invalid; this environment is unchanged.
           RuntimeError: only some simulations are restored before the first reset.
         """
         with self._one_thread:
@@ -328,8 +327,8 @@ class VectorEnvironment:
         is drawn from these streams.
 
         Args:
-          other: environment with the same id and options.
-          other_ids: numbers of its simulations.
+          other: environment with the same id and options, or this one.
+          other_ids: numbers of its simulations, whose states before the call are copied.
           env_ids: numbers of as many simulations of this environment, without repeats.
 
         Raises:
@@ -343,10 +342,10 @@ class VectorEnvironment:
             simulations, others = self._usable(), other._usable()
             if simulations.fresh or others.fresh:
                 raise RuntimeError('copy_from before the first reset')
-            if not (equal(other.spec, self.spec) and equal(other._task_kwargs, self._task_kwargs)):
+            difference = states.differences(others.signature, simulations.signature)
+            if difference:
                 raise ValueError(
-                    f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options '
-                    'differ'
+                    f'cannot copy simulations of {other.spec.id} to {self.spec.id}: {difference}'
                 )
             sources = arguments.given_ids(other_ids, other.num_envs)
             ids = arguments.given_ids(env_ids, self.num_envs)

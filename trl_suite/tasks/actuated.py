@@ -48,9 +48,8 @@ class Actuated(Wrapper):
         super().__init__(task)
 
     @property
-    def signature(self) -> str:
-        options = ', '.join(f'{name} {value}' for name, value in self.actuators.changed.items())
-        return f'{self.task.signature} by actuators with {options}'
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {**self.task.made_of, 'actuators': (str(self.actuators.changed), self.actuators)}
 
     def bind(self, world: World) -> None:
         self.world = world

@@ -84,9 +84,10 @@ class Composed(Wrapper):
         self.mirror = None  # unknown for the added blocks
 
     @property
-    def signature(self) -> str:
-        added = ', '.join([*self._rewards, *self._extras, *self._failures])
-        return f'{self.task.signature} with {added}'
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        added = self._rewards, self._extras, self._failures
+        label = ', '.join(name for group in added for name in group)
+        return {**self.task.made_of, 'additions': (label, added)}
 
     def bind(self, world: World) -> None:
         self.task.bind(world)

@@ -213,11 +213,6 @@ class SpatialTask(Task):
     def root_entity(self) -> SpatialArena:
         return self.arena
 
-    @property
-    def signature(self) -> str:
-        parts = self.character.spec.name, self.arena.terrain.name, self.motion.name
-        return f'{super().signature} of {" / ".join(parts)}'
-
     def _bind_rules(self, world: World) -> SpatialRules:
         """Binds the common parts; a subclass may extend `saved` and `info_arrays` afterwards."""
         self.world, n = world, world.n

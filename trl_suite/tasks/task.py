@@ -249,11 +249,27 @@ class Task(composer.Task):
         return self.outcome.diverged
 
     @property
-    def signature(self) -> str:
-        """A description of the task, for messages and to check which task a saved state is for."""
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        """What the task is made of, by name: labels, and the contents that sign saved states."""
         blocks = ', '.join(f'{name} {part.stop - part.start}' for name, part in self.blocks.items())
         steps = f'{self._substeps} x {self.physics_timestep:.6g} s'
-        return f'{type(self).__name__} by {self.action_map.quantity} ({blocks}; {steps})'
+        label = f'{type(self).__name__} by {self.action_map.quantity} ({blocks}; {steps})'
+        actions = self.action_map
+        # In single precision: computed numbers depend on the type of processor.
+        numbers = np.array([actions.action_offset, actions.action_scale], np.float32)
+        contents = label, type(self), actions.names, numbers
+        found: dict[str, tuple[str, Any]] = {'task': (label, contents)}
+        config = getattr(self, 'config', None)
+        found['options'] = type(config).__name__, config
+        for name, of, part in (
+            ('character', 'character', 'spec'), ('terrain', 'arena', 'terrain'),
+            ('motion', 'motion', None), ('motion', 'clip', None),
+        ):  # fmt: skip
+            value = getattr(self, of, None)
+            value = value if part is None else getattr(value, part, None)
+            if value is not None:
+                found[name] = getattr(value, 'name', ''), getattr(value, 'contents', value)
+        return found
 
     # Composer's interface: one simulation.
 

@@ -42,6 +42,10 @@ class Wrapper(Task):
         self.task.watch = look  # type: ignore[attr-defined]
 
     @property
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return self.task.made_of
+
+    @property
     def root_entity(self) -> composer.Entity:
         return self.task.root_entity
 

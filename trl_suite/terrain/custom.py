@@ -52,6 +52,12 @@ class CustomTerrain(Terrain):
 
     recipe: tuple[Any, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
+    @property
+    def contents(self) -> tuple[Any, ...]:
+        # The type of an array is named by a hash of it.
+        source = self.recipe[1][0]
+        return self.type, self.parameter_sets, source if callable(source) else None
+
     def __reduce__(self) -> tuple[Any, ...]:
         return self.recipe
 

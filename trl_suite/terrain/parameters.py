@@ -94,6 +94,12 @@ class Terrain:
         """Whether it is three-dimensional: a `SpatialGround`, not a `PlanarGround`."""
         return self.type in GENERATORS3D
 
+    @property
+    def contents(self) -> tuple[Any, ...]:
+        """What the ground depends on: type, parameter sets, and the functions of the type."""
+        registry: Mapping[str, Any] = GENERATORS3D if self.spatial else GENERATORS
+        return self.type, self.parameter_sets, tuple(registry[self.type])
+
     def parameters(self, terrain_level: float = 0.0) -> dict[str, float]:
         """Returns a value for every parameter of the type.
 

@@ -118,6 +118,15 @@ class Config:
             for field in dataclasses.fields(cls)
         ]  # fmt: skip
 
+    @property
+    def changed(self) -> dict[str, Any]:
+        """The options that differ from the defaults, by name."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if getattr(self, field.name) != field.default
+        }
+
     def _set(self, name: str, value: Any) -> None:
         """Replaces a value by its canonical form; for `__post_init__` of subclasses."""
         object.__setattr__(self, name, value)
@@ -146,21 +155,3 @@ def _check_bounds(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
         what = 'numbers' if np.ndim(value) else 'a number'
         unit = f', in {metadata["unit"]}' if metadata['unit'] else ''
         raise ValueError(f'{name} is {value}; expected {what} {" and ".join(words)}{unit}')
-
-
-def equal(one: Any, other: Any) -> bool:
-    """Whether options are equal; unlike ==, also where they hold arrays."""
-    if one is other:
-        return True
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        return np.array_equal(one, other)
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-    if type(one) is not type(other):
-        return bool(one == other)
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(equal, one, other))
-    if dataclasses.is_dataclass(one):
-        names = [field.name for field in dataclasses.fields(one)]
-        return all(equal(getattr(one, name), getattr(other, name)) for name in names)
-    return bool(one == other)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +20,6 @@ from trl_suite.tasks.task import Marker, Outcome, Task, _each
 from trl_suite.tasks.wrapper import Wrapper
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled_loop, packed
-from trl_suite.util.options import Config
 from trl_suite.util.random import Streams
 
 PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
@@ -69,10 +67,10 @@ class Disturbed(Wrapper):
         super().__init__(task)
 
     @property
-    def signature(self) -> str:
+    def made_of(self) -> dict[str, tuple[str, Any]]:
         configs = {'randomize': self._world_config, 'sensors': self._sensor_config}
-        given = [f'{name} {_given(config)}' for name, config in configs.items() if config]
-        return f'{self.task.signature} with {", ".join(given)}'
+        given = {name: (str(each.changed), each) for name, each in configs.items() if each}
+        return {**self.task.made_of, **given}
 
     def bind(self, world: World) -> None:
         self.task.bind(world)
@@ -262,15 +260,6 @@ def _seeded(env_id: int, seed: np.random.SeedSequence, stream: np.ndarray) -> No
     streams = Streams(1)
     streams.seed(0, seed)
     stream[env_id] = streams.state[0]
-
-
-def _given(config: Config) -> dict[str, Any]:
-    """Returns the options that differ from their defaults."""
-    return {
-        field.name: getattr(config, field.name)
-        for field in dataclasses.fields(config)
-        if getattr(config, field.name) != field.default
-    }
 
 
 def _row(array: np.ndarray, env_id: int) -> Any:

@@ -164,9 +164,8 @@ class GaitTask(Task):
         return self.arena
 
     @property
-    def signature(self) -> str:
-        parts = self.character.spec.name, self.arena.terrain.name, self.interface
-        return f'{super().signature} of {" / ".join(parts)}'
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {**super().made_of, 'gait': (self.interface, self.gait.parameters)}
 
     @property
     def steps_per_call(self) -> int:

@@ -196,11 +196,6 @@ class PlanarImitation(Task):
     def root_entity(self) -> PlanarArena:
         return self.arena
 
-    @property
-    def signature(self) -> str:
-        parts = self.character.spec.name, self.arena.terrain.name, self.clip.name
-        return f'{super().signature} of {" / ".join(parts)}'
-
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure, spec = self.figure, self.character.spec

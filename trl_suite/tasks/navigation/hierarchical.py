@@ -231,6 +231,10 @@ class HierarchicalNavigation(SpatialTask):
         mirrors = interface == 'plan' and self.character.spec.mirror
         self.mirror = planning_mirror(character, self.blocks, goal_signs) if mirrors else None
 
+    @property
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
+
     def _typical_poses(self) -> np.ndarray:
         return typical_poses(self.steps, self._first)
 

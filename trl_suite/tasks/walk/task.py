@@ -154,11 +154,6 @@ class Walk(Task):
     def root_entity(self) -> PlanarArena | SpatialArena:
         return self.arena
 
-    @property
-    def signature(self) -> str:
-        parts = self.character.spec.name, self.arena.terrain.name
-        return f'{super().signature} of {" / ".join(parts)}'
-
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure = self.figure
