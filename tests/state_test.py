@@ -377,6 +377,81 @@ class SignatureTest(parameterized.TestCase):
         environment.set_state(states.seal({**environment.get_state(), 'steps': 0}))
 
 
+BEYOND = {  # where no ground is drawn, by environment, and the height above the ground there
+    DOG: (999_983.0, -999_983.0, 3e5), GAITS[0]: (999_983.0,),
+    'PD_Biped2D_LLC_Flat_Step-v0': (999_983.0,),
+    'PD_Biped3D_Imitate-Stairs_Terrain-v0': ((999_983.0, 0.0), (0.0, -999_983.0), (3e9, 0.0)),
+    'PD_Biped3D_HLC_PathFollowing-v0': ((999_983.0, 0.0),),
+}  # fmt: skip
+
+
+class FarTest(parameterized.TestCase):
+    """Who leaves the ground ends its episode; the others go on."""
+
+    @parameterized.parameters(*((id_, place) for id_, places in BEYOND.items() for place in places))
+    def test_beyond_the_border(self, id_, place):
+        one, other = (VectorEnvironment(id_, 2, 1, 3, step_limit=None) for _ in range(2))
+        idle = np.zeros((2, len(one.action_map)))
+        for each in one, other:
+            each.reset()
+            each.step(idle)
+        world, figure = one.task.world, one.task.figure
+        place = np.atleast_1d(place)
+        world.qpos[0, figure.pose_qpos[: len(place)]] = place
+        world.qpos[0, figure.pose_qpos[1 if len(place) == 1 else 2]] += 5.0
+        world.forward(world.all_ids)
+        step, expected = one.step(idle), other.step(idle)
+        np.testing.assert_array_equal(step.info['diverged'], [True, False])
+        np.testing.assert_array_equal(step.terminated[0], True)
+        self.assertTrue(np.isfinite(step.observation).all() and np.isfinite(step.reward).all())
+        for _ in range(3):
+            np.testing.assert_array_equal(step.observation[1], expected.observation[1])
+            self.assertEqual(step.reward[1], expected.reward[1])
+            step, expected = one.step(idle), other.step(idle)
+            self.assertTrue(np.isfinite(step.observation).all())
+
+    @parameterized.parameters(
+        ('PD_Biped3D_Imitate-Ramp_Terrain-v0', (1000.9, 0.0)),
+        ('PD_Biped3D_Imitate-Ramp_Terrain-v0', (3.0, 1000.5)),
+        ('PD_Biped3D_Imitate-Stairs_Terrain-v0', (5.0, -1000.5)),
+        ('PD_Biped3D_Imitate-Stairs_Terrain-v0', (5.0, 5000.0)),
+    )
+    def test_over_the_rim_of_the_ground(self, id_, place):
+        environment = suite.make(id_, {'random': 3, 'step_limit': None})
+        environment.reset()
+        data, root = environment.physics.data, environment.task.figure.pose_qpos[:3]
+        data.qpos[root] = *place, data.qpos[root[2]] + 3.0
+        environment.task.world.forward(environment.task.world.all_ids)
+        for _ in range(300):
+            step = environment.step(np.zeros(len(environment.action_map)))
+            for name, block in step.observation.items():
+                self.assertTrue(np.isfinite(block).all(), name)
+            if step.last():
+                break
+        self.assertEqual(step.discount, 0)
+        self.assertTrue(environment.info['diverged'])
+
+    def test_states_do_not_grow_with_the_distance(self):
+        environment = suite.make(DOG, {'random': 6, 'step_limit': None})
+        environment.reset()
+        sizes = []
+        for x in 0.0, 1e5:
+            environment.task.arena.follow(np.array([[x]]))
+            ground = environment.task.arena.grounds[0]
+            environment.physics.data.qpos[:2] = x, ground.height(x) + 1.0
+            environment.task.world.forward(environment.task.world.all_ids)
+            state = environment.get_state()
+            sizes.append(len(pickle.dumps(state)))
+        self.assertLess(sizes[1], sizes[0] + 1000)
+        other = suite.make(DOG, {'random': 8, 'step_limit': None})
+        other.set_state(pickle.loads(pickle.dumps(state)))
+        np.testing.assert_array_equal(advance(other, 20), advance(environment, 20))
+        for each in environment, other:
+            np.testing.assert_array_equal(
+                each.task.arena.grounds[0].window(-240, 961), ground.window(-240, 961)
+            )
+
+
 class DivergenceTest(parameterized.TestCase):
     """Who goes back to a state before the physics broke down goes on as if it never had."""
 

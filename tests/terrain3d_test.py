@@ -555,6 +555,21 @@ class GroundTest(parameterized.TestCase):
                 inside = place + rng.uniform(-room, room, (50, 2))
                 np.testing.assert_array_equal(ground.height(*inside.T), 0)
 
+    @parameterized.parameters(('ramp', (1000.9, 0.0)), ('stairs', (3.0, -1000.5)))
+    def test_where_the_ground_ends(self, name, root):
+        """Goals, and surfaces in windows, are finite also beyond it."""
+        source = next(each for preset, each in terrain.PRESETS3D.items() if name in preset)
+        ground, rng = terrain.SpatialGround(source, 3), np.random.default_rng(0)
+        goals = np.array([ground.goal(rng, root) for _ in range(50)])
+        exact = ground.height(*goals[:, :2].T)
+        self.assertTrue(np.isinf(exact).any())
+        self.assertTrue(np.isfinite(goals).all())
+        around = terrain.Surroundings(1, terrain.capacity(source))
+        around.begin(0, ground, root)
+        found = around.height(goals[None, :, 0], goals[None, :, 1])[0]
+        np.testing.assert_allclose(found[np.isfinite(exact)], exact[np.isfinite(exact)], atol=1e-9)
+        self.assertLess(found[np.isinf(exact)].max(), exact.max() - 9)
+
     def test_goals_are_clear_of_the_current_boxes(self):
         ground, rng = make('dynamic_obstacles3d', 2), np.random.default_rng(0)
         centres = rng.uniform(-3, 3, (50, 2))

@@ -14,6 +14,7 @@ from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
 from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
 from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.generators import BORDER
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
@@ -107,6 +108,7 @@ class PlanarArena(composer.Arena):
         """
         env_ids = self._numbers if env_ids is None else env_ids
         far = np.abs(x[:, 0] - self.ground.centre[env_ids]) > self.ground.reach
+        far &= np.abs(x[:, 0]) < BORDER
         if far.any():
             self.follow_all(env_ids[far], x[far, 0])
 

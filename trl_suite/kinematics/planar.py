@@ -185,6 +185,12 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 
 
 @compiled
+def is_lost(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows) -> bool:
+    """Returns whether a character is where no ground is drawn; its episode then ends as diverged."""
+    return planar_ground.is_lost(i, state.qpos[i, body.qpos[0]], ground)
+
+
+@compiled
 def leaves(
     i: int,
     body: PlanarBody,

@@ -131,6 +131,13 @@ def feature_columns(body: SpatialBody) -> dict[str, slice]:
 
 
 @compiled
+def is_lost(i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows) -> bool:
+    """Returns whether a character is where there is no ground; its episode then ends as diverged."""
+    root = state.xpos[i, body.links[0]]
+    return spatial_ground.is_lost(i, root[0], root[1], root[2], ground)
+
+
+@compiled
 def measure(
     i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows,
     measurement: SpatialMeasurement,

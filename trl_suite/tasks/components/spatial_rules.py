@@ -12,6 +12,7 @@ from trl_suite.kinematics.spatial import (
     SpatialBody,
     SpatialMeasurement,
     SpatialState,
+    is_lost,
 )
 from trl_suite.kinematics.spatial import measure as measure_body
 from trl_suite.tasks.components.observation import write_body, write_terrain
@@ -175,9 +176,11 @@ def read_clock(i: int, rules: SpatialRules) -> None:
 
 @compiled
 def breaks_down(i: int, rules: SpatialRules) -> bool:
-    """Returns whether the physics has diverged; the caller then keeps the last observation."""
-    diverged = native.diverged(i, rules.engine) or too_fast(
-        i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
+    """Returns whether a simulation diverged or left its ground: it keeps the last observation."""
+    diverged = (
+        native.diverged(i, rules.engine)
+        or too_fast(i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel)
+        or is_lost(i, rules.body, rules.physics, rules.ground)
     )
     rules.outcome.diverged[i] = diverged
     return diverged

@@ -13,6 +13,7 @@ from trl_suite.engine import native
 from trl_suite.kinematics.planar import (
     PlanarBody,
     PlanarMeasurement,
+    is_lost,
     leaves,
     measure,
     must_wait,
@@ -255,10 +256,12 @@ def look(i: int, rules: Rules) -> None:
 
 @compiled
 def breaks_down(i: int, rules: Rules) -> bool:
-    """Returns whether the physics has diverged; the caller then keeps the last observation."""
+    """Returns whether a simulation diverged or left its ground: it keeps the last observation."""
     joints = rules.body.dof[3:]
-    diverged = native.diverged(i, rules.engine) or too_fast(
-        i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel
+    diverged = (
+        native.diverged(i, rules.engine)
+        or too_fast(i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel)
+        or is_lost(i, rules.body, rules.gait.physics, rules.ground)
     )
     rules.outcome.diverged[i] = diverged
     return diverged
@@ -270,7 +273,9 @@ def finish_step(i: int, rules: Rules) -> None:
     state, outcome = rules.state, rules.outcome
     state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
     state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
-    outcome.diverged[i] |= native.diverged(i, rules.engine)
+    outcome.diverged[i] |= native.diverged(i, rules.engine) or is_lost(
+        i, rules.body, rules.gait.physics, rules.ground
+    )
     failed = outcome.failed[i] or outcome.diverged[i]
     if outcome.diverged[i]:
         state.fell[i] = state.stuck[i] = False

@@ -13,6 +13,7 @@ from trl_suite.kinematics.planar import (
     PlanarMeasurement,
     PlanarState,
     has_fallen,
+    is_lost,
     leaves,
     measure,
     must_wait,
@@ -136,10 +137,12 @@ def advance_clock(i: int, clip: ClipTable, state: ImitationState) -> None:
 
 @compiled
 def breaks_down(i: int, rules: Rules) -> bool:
-    """Returns whether the physics has diverged; the caller then keeps the last observation."""
+    """Returns whether a simulation diverged or left its ground: it keeps the last observation."""
     joints = rules.body.dof[2:]
-    diverged = native.diverged(i, rules.engine) or too_fast(
-        i, joints, MAX_JOINT_SPEED, rules.physics.qvel
+    diverged = (
+        native.diverged(i, rules.engine)
+        or too_fast(i, joints, MAX_JOINT_SPEED, rules.physics.qvel)
+        or is_lost(i, rules.body, rules.physics, rules.ground)
     )
     rules.outcome.diverged[i] = diverged
     return diverged

@@ -122,8 +122,10 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
     for i in env_ids:
         outcome = rules.outcome
         if stepped:
-            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
-                i, rules.body.dof[3:], MAX_JOINT_SPEED, rules.physics.qvel
+            outcome.diverged[i] = (
+                native.diverged(i, rules.engine)
+                or too_fast(i, rules.body.dof[3:], MAX_JOINT_SPEED, rules.physics.qvel)
+                or planar.is_lost(i, rules.body, rules.physics, rules.ground)
             )
             if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)
@@ -181,8 +183,10 @@ def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> i
     for i in env_ids:
         outcome = rules.outcome
         if stepped:
-            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
-                i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
+            outcome.diverged[i] = (
+                native.diverged(i, rules.engine)
+                or too_fast(i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel)
+                or spatial.is_lost(i, rules.body, rules.physics, rules.ground)
             )
             if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)

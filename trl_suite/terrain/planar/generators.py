@@ -3,8 +3,9 @@
 A planar terrain is a polyline with vertices SPACING apart. A generator is a function of
 (parameters, length in m, random generator) that returns a `Profile`: the vertices to append to the
 existing ground, whose last vertex is at height 0. It repeats its feature until the length is
-reached, so it overshoots by up to one feature. `features.py` has the original's terrain types.
-`register` adds a type:
+reached, so it overshoots by up to one feature. It must depend on its arguments only: ground that
+was forgotten is generated again, and a saved state holds the seed, not the ground. `features.py`
+has the original's terrain types. `register` adds a type:
 
     @register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
     def saw(parameters, length, rng):
@@ -31,6 +32,7 @@ from trl_suite.util.errors import unknown
 SPACING = 0.025  # m between vertices
 STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
 LONGEST = 1e6  # m; largest length of a stretch, and largest |x| of a query
+BORDER = LONGEST - 1e3  # m; a character beyond has left the ground; its goals are nearer to it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

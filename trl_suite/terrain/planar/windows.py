@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import SPACING
+from trl_suite.terrain.planar.generators import BORDER, SPACING
 from trl_suite.util.compiled import compiled_inline, nearest_index
 
-FARTHEST = (
-    1e4  # m from its window; a character farther away has diverged, and its window is not refilled
-)
+FARTHEST = 1e4  # m from its window; a character that is suddenly farther away is lost
 
 _CELLS_PER_METRE = 1 / SPACING
 
@@ -102,6 +100,12 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
 
 
 @compiled_inline
+def is_lost(i: int, x: float, ground: PlanarWindows) -> bool:
+    """Returns whether a character at x, m, is where no ground is drawn; its episode then ends."""
+    return not (abs(x) < BORDER and abs(x - ground.centre[i]) < FARTHEST)
+
+
+@compiled_inline
 def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether the window of simulation i must be refilled for a character at x, m."""
-    return ground.reach < abs(x - ground.centre[i]) < FARTHEST
+    return ground.reach < abs(x - ground.centre[i]) and not is_lost(i, x, ground)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -75,7 +76,7 @@ class SpatialGround:
 
     def state(self) -> dict[str, Any]:
         """Returns what `from_state` needs: type, parameters and seed."""
-        entropy, spawn_key = self._seed
+        entropy, spawn_key = copy.copy(self._seed[0]), self._seed[1]
         return {
             'type': self.type,
             'parameters': dict(self.parameters),
@@ -97,7 +98,7 @@ class SpatialGround:
     def height(
         self, x: npt.ArrayLike, y: npt.ArrayLike, movers: np.ndarray | None = None
     ) -> np.ndarray:
-        """Heights of the surface at points, m.
+        """Heights of the surface at points, m; -inf where there is no ground.
 
         Args:
           x, y: m, of one shape.
@@ -254,8 +255,8 @@ class SpatialGround:
             ahead = 1 + int(random.uniform() * (10 if rule == 'far' else 1))
             middle = 0.5 * (trail.start + trail.end)
             nearest = int(np.linalg.norm(middle - root, axis=1).argmin())
-            k = nearest + ahead
-            trail.extend(k + 1)
+            trail.extend(nearest + ahead + 1)
+            k = min(nearest + ahead, len(trail.start) - 1)
             along = random.uniform() * (trail.end[k] - trail.start[k])
             aside = trail.width[k] * random.uniform(-TRAIL_OFFSET, TRAIL_OFFSET)
             heading = trail.heading[k]
@@ -270,7 +271,8 @@ class SpatialGround:
             x, y = root + [random.uniform(-GOAL_SPREAD, GOAL_SPREAD) for _ in range(2)]
         else:
             x, y = root[0] + random.uniform(distance, GOAL_SPREAD), 0.0
-        return np.array([x, y, float(self.height(x, y, movers))])
+        height = float(self.height(x, y, movers))
+        return np.array([x, y, height if math.isfinite(height) else 0.0])  # beyond the ground
 
     def _clear(
         self, random: Random, room: float, movers: np.ndarray | None

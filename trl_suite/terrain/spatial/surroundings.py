@@ -9,11 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain.parameters import Terrain
+from trl_suite.terrain.planar.generators import BORDER
 from trl_suite.terrain.spatial import index
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, NO_BOXES, Boxes
 from trl_suite.terrain.spatial.windows import (
+    DEPTH,
     HALF,
     SAMPLES,
     SHIFT,
@@ -25,7 +27,6 @@ from trl_suite.util.compiled import compiled
 
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
 SPARE = 1.3  # factor applied to the largest number of boxes in these grounds
-FARTHEST = 1e10  # m; largest position that the engine accepts
 
 EnvIds = slice | np.ndarray
 ALL = slice(None)
@@ -132,7 +133,7 @@ class Surroundings:
             )
         arrays = self.arrays
         self.grounds[env_id] = ground
-        arrays.level[env_id] = -np.inf if layout.level is None else layout.level
+        arrays.level[env_id] = 0.0 if layout.level is None else layout.level
         self.half_size[env_id], self.speed[env_id] = -1.0, 0.0
         if layout.movers is not None:
             part = layout.movers
@@ -152,15 +153,15 @@ class Surroundings:
           env_ids: sorted numbers of simulations; None for all.
 
         Returns:
-          The simulations whose windows were refilled. Those of a character beyond `FARTHEST` stay
-          where they are: the engine ends its episode in the next step.
+          The simulations whose windows were refilled. Those of a character beyond `BORDER` stay
+          where they are: its episode ends in the next step.
         """
         if not self.windowed:
             return []
         moved = np.abs(xy - (self.centre if env_ids is None else self.centre[env_ids]))
         if not moved.max(initial=0.0) > SHIFT:
             return []
-        far = np.flatnonzero((moved.max(1) > SHIFT) & (np.abs(xy).max(1) < FARTHEST))
+        far = np.flatnonzero((moved.max(1) > SHIFT) & (np.abs(xy).max(1) < BORDER))
         leaving = (far if env_ids is None else env_ids[far]).tolist()
         for env_id, centre in zip(leaving, np.round(xy[far] / SHIFT) * SHIFT, strict=True):
             self._lay(env_id, centre)
@@ -318,15 +319,21 @@ class Surroundings:
         arrays = self.arrays
         arrays.centre[env_id] = centre
         low, high = centre - HALF, centre + HALF
-        if self.capacity.grid:
-            if layout.grid is None:
-                arrays.grid[env_id] = arrays.level[env_id]
-            else:
-                i, j = (np.arange(VERTICES) + round(edge / GRID) for edge in low.tolist())
-                arrays.grid[env_id] = layout.vertices(i, j).reshape(-1)
-        if not self.capacity.boxes + self.capacity.belts:
+        boxes, some = NO_BOXES, self.capacity.boxes + self.capacity.belts > 0
+        if some:
+            boxes = layout.boxes_in(low, high)
+        if layout.grid is not None:
+            i, j = (np.arange(VERTICES) + round(edge / GRID) for edge in low.tolist())
+            arrays.grid[env_id] = layout.vertices(i, j).reshape(-1)
+        if layout.level is None:
+            lowest = boxes.top - np.abs(boxes.slope) * boxes.half_size[:, 0]
+            if layout.grid is not None:
+                lowest = arrays.grid[env_id]
+            arrays.level[env_id] = lowest.min(initial=0.0) - DEPTH
+        if self.capacity.grid and layout.grid is None:
+            arrays.grid[env_id] = arrays.level[env_id]
+        if not some:
             return
-        boxes = layout.boxes_in(low, high)
         if len(boxes.top) > self.capacity.boxes:  # boxes at the rim may be missing
             gap = np.abs(boxes.position - centre) - boxes.extent()
             nearest = np.argsort(gap.max(1), kind='stable')[: self.capacity.boxes]

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.terrain.planar.generators import BORDER
 from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
 from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
 HALF = 16.0  # m; half side of a window
+DEPTH = 10.0  # m; where ground ends, the surface is so far below the lowest part of the window
 SHIFT = 4.0  # m; window centres are multiples of it; windows of characters farther away are moved
 VERTICES = round(2 * HALF / GRID) + 1  # of the height grid of a window, along each axis
 SQUARES = (32, 32)  # bins of a window along x and y
@@ -62,7 +64,7 @@ class SpatialWindows(NamedTuple):
     are changed in place and never replaced.
 
     Attributes:
-      level: level of the plane, (n,) m; -inf if there is none.
+      level: level of the plane; if there is none, a surface DEPTH below all parts, (n,) m.
       centre: centres of the windows, (n, 2) m.
       grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
       boxes: values in the columns above, (n, B, 8); HALF_X is -1 where there is no box.
@@ -106,7 +108,7 @@ def empty(n: int, capacity: Capacity) -> SpatialWindows:
     boxes, movers = capacity.boxes + capacity.belts, capacity.movers
     bins = (STRIPS if capacity.strips else SQUARES) if boxes else (0, 0)
     ground = SpatialWindows(
-        level=np.full(n, -np.inf),
+        level=np.zeros(n),
         centre=np.zeros((n, 2)),
         grid=np.zeros((n, VERTICES**2 if capacity.grid else 0), np.float32),
         boxes=np.zeros((n, boxes, 8)),
@@ -209,6 +211,12 @@ def velocity_map(
                 east, north = velocity(i, at_x, at_y, ground)
                 ahead, aside = _turned(east, north, under, cosine, sine)
                 out[SAMPLES * v + u], out[_COUNT + SAMPLES * v + u] = ahead, aside
+
+
+@compiled_inline
+def is_lost(i: int, x: float, y: float, z: float, ground: SpatialWindows) -> bool:
+    """Returns whether a character is beyond the edge of the ground or fell below its lowest part."""
+    return not (abs(x) < BORDER and abs(y) < BORDER and z > ground.level[i] - DEPTH)
 
 
 @compiled
