@@ -266,6 +266,9 @@ class SingleTest(Same, parameterized.TestCase):
     @parameterized.parameters(
         ({'render_mode': 'rgb_aray'}, 'rgb_array'),
         ({'render_mode': 'human'}, 'render_mode'),
+        ({'render_kwargs': {'heigth': 48}}, "'heigth'; did you mean 'height'"),
+        ({'render_kwargs': {'height': 1081}}, 'height is 1081'),
+        ({'render_kwargs': {'camera': 'sid'}}, "camera 'sid'; did you mean 'side'"),
         ({'dtype': np.int32}, 'int32'),
         ({'task_kwargs': {'step_limt': 3}}, 'step_limt'),
     )

@@ -82,8 +82,10 @@ class FrameTest(parameterized.TestCase):
         ({'camera': 'sid'}, "unknown camera 'sid'; did you mean 'side'"),
         ({'camera': 2}, r'camera is 2; expected -1 to 1'),
         ({'camera': -2}, r'camera is -2'),
-        ({'height': 0}, 'height is 0; expected 1 to 1080'),
-        ({'width': 1921}, 'width is 1921; expected 1 to 1920'),
+        ({'camera': None}, 'camera is None; expected a string or a whole number'),
+        ({'height': 0}, 'height is 0; expected a whole number from 1 to 1080 pixels'),
+        ({'width': 1921}, 'width is 1921; expected a whole number from 1 to 1920 pixels'),
+        ({'ghost': 'no'}, "ghost is 'no'; expected True or False"),
     )
     def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):

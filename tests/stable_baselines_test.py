@@ -108,6 +108,8 @@ class StableBaselinesTest(parameterized.TestCase):
         self.assertEqual(SuiteVecEnv(FLAT, 2, 1).get_images(), [None, None])
         with self.assertRaisesRegex(ValueError, 'rgb_array'):
             SuiteVecEnv(FLAT, 2, 1, render_mode='rgb')
+        with self.assertRaisesRegex(ValueError, "'sid'; did you mean 'side'"):
+            SuiteVecEnv(FLAT, 2, 1, render_kwargs={'camera': 'sid'})
 
     def test_attributes(self):
         envs = SuiteVecEnv(FLAT, 3, 1)

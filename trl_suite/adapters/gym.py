@@ -16,6 +16,7 @@ environment's step limit truncates it; `info` has 'fell', 'diverged', 'distance'
 
 from __future__ import annotations
 
+import inspect
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -43,6 +44,7 @@ except ImportError as error:
 
 METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most ids
 BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; others are unbounded
+RENDER_OPTIONS = tuple(inspect.signature(rendering.frame).parameters)[1:]
 Info = dict[str, Any]
 
 
@@ -70,15 +72,13 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
           dtype: dtype of observations and actions, float32 or float64.
           max_episode_steps: truncate after this number of steps, instead of the step limit of the id;
             -1 for never. If `task_kwargs` has a 'step_limit', the smaller one counts.
-          render_mode: 'rgb_array', or None for no rendering.
-          render_kwargs: options of `trl_suite.rendering.frame`.
+          render_mode: 'rgb_array', or None for no rendering. Gymnasium's `RecordVideo` needs the
+            package moviepy.
+          render_kwargs: options of `trl_suite.rendering.frame`: height, width, camera, ghost.
 
         Raises:
           ValueError: unknown names or options; the message has the closest matches.
         """
-        if render_mode not in (None, 'rgb_array'):
-            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
-        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
             spec = catalogue.spec_of(environment)
             environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
@@ -87,6 +87,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'
             )
         self.environment, self._flat, self._dtype = environment, flat_observation, np.dtype(dtype)
+        self.render_mode = render_mode
+        self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
         self.metadata = metadata(environment.task)
         shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
         self.observation_space = observation_space(shapes, flat_observation, dtype)
@@ -171,9 +173,6 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if mode not in modes:
             raise ValueError(errors.unknown('autoreset_mode', mode, modes))
         self.autoreset_mode = modes[mode]  # as in Gymnasium; TorchRL reads it
-        if render_mode not in (None, 'rgb_array'):
-            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
-        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         spec = catalogue.spec_of(environment)
         options = limited(task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
@@ -181,6 +180,8 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
             task_kwargs=options,
         )  # fmt: skip
+        self.render_mode = render_mode
+        self._render_kwargs = rendered(render_mode, render_kwargs, self.environment.task)
         self.metadata = {**metadata(self.environment.task), 'autoreset_mode': modes[mode]}
         self.num_envs = n = self.environment.num_envs
         shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
@@ -235,6 +236,19 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 def metadata(task: Any) -> Info:
     """Metadata of rendering; one frame per step plays in real time, except for gait cycles."""
     return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
+
+
+def rendered(render_mode: str | None, render_kwargs: Info | None, task: Any) -> Info:
+    """Returns `render_kwargs` if it and `render_mode` are valid for a task."""
+    if render_mode not in (None, 'rgb_array'):
+        raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
+    options = errors.options('render_kwargs', render_kwargs)
+    for name in options:
+        if name not in RENDER_OPTIONS:
+            raise ValueError(errors.unknown('option in render_kwargs', name, RENDER_OPTIONS))
+    if render_mode or options:
+        rendering.check_options(task.world.models[0], task, **options)
+    return options
 
 
 def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:

@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.adapters.gym import action_space, flat, observation_space
+from trl_suite.adapters.gym import action_space, flat, observation_space, rendered
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.util import errors
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -58,14 +57,11 @@ class SuiteVecEnv(VecEnv):
           seed: one seed, from which that of each simulation is derived, or a sequence of n seeds.
           flat_observation: return one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
           render_mode: 'rgb_array', or None for no rendering.
-          render_kwargs: options of `trl_suite.rendering.frame`.
+          render_kwargs: options of `trl_suite.rendering.frame`: height, width, camera, ghost.
 
         Raises:
           ValueError: unknown names or options; the message has the closest matches.
         """
-        if render_mode not in (None, 'rgb_array'):
-            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
-        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, VectorEnvironment):
             environment = VectorEnvironment(
                 environment, num_envs, num_threads, seed, autoreset='same_step', dtype=np.float32,
@@ -73,7 +69,8 @@ class SuiteVecEnv(VecEnv):
             )  # fmt: skip
         elif environment.autoreset != 'same_step':
             raise ValueError(f"autoreset is {environment.autoreset!r}; expected 'same_step'")
-        self.environment = environment
+        self.environment, self.render_mode = environment, render_mode
+        self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
         shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
         super().__init__(
             self.environment.num_envs,

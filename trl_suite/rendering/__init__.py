@@ -1,6 +1,15 @@
 """Rendering without a display: frames, videos, film strips, plots of terrain, height maps."""
 
-from trl_suite.rendering.drawing import Policy, check_gl, frame, frames, no_gl, replay, watching
+from trl_suite.rendering.drawing import (
+    Policy,
+    check_gl,
+    check_options,
+    frame,
+    frames,
+    no_gl,
+    replay,
+    watching,
+)
 from trl_suite.rendering.pictures import (
     IMAGE_SUFFIXES,
     REPLAY_SUFFIXES,
@@ -21,6 +30,7 @@ __all__ = [
     'Policy',
     'Video',
     'check_gl',
+    'check_options',
     'film_strip',
     'frame',
     'frames',

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import operator
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -75,18 +74,11 @@ def frame(
 def _frame(
     environment: composer.Environment, height: int, width: int, camera: str | int, ghost: bool
 ) -> np.ndarray:
-    physics = environment.physics
-    limits = physics.model.vis.global_
-    for name, size, limit in (
-        ('height', height, limits.offheight),
-        ('width', width, limits.offwidth),
-    ):
-        if not 0 < operator.index(size) <= limit:
-            raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
     from trl_suite.rendering import cameras, overlays
 
-    drawn = overlays.of_task(environment.task, ghost)
-    camera_id = _camera(physics, camera)
+    physics, task = environment.physics, environment.task
+    camera_id = check_options(physics.model.ptr, task, height, width, camera, ghost)
+    drawn = overlays.of_task(task, ghost)
     check_gl(physics)
 
     def add(physics: Any, scene: Any) -> None:
@@ -94,7 +86,38 @@ def _frame(
             overlay(physics, scene)
 
     with cameras.outside_obstacles(physics, camera_id):
-        return physics.render(height, width, camera_id, scene_callback=add if drawn else None)
+        return physics.render(
+            int(height), int(width), camera_id, scene_callback=add if drawn else None
+        )
+
+
+def check_options(
+    model: Any,
+    task: Any,
+    height: int = 480,
+    width: int = 640,
+    camera: str | int = 'side',
+    ghost: bool = False,
+) -> int:
+    """Checks the options of `frame`; returns the number of the camera.
+
+    Args:
+      model: the `mujoco.MjModel`; it may lack visual assets.
+      task: its task.
+      height, width, camera, ghost: as for `frame`.
+
+    Raises:
+      ValueError: as for `frame`.
+    """
+    from trl_suite.rendering import overlays
+
+    limits = model.vis.global_
+    errors.check_whole('height', height, 1, limits.offheight, ' pixels')
+    errors.check_whole('width', width, 1, limits.offwidth, ' pixels')
+    errors.check_kind('camera', camera, str | int)
+    errors.check_kind('ghost', ghost, bool)
+    overlays.of_task(task, ghost)
+    return _camera(model, camera)
 
 
 def frames(
@@ -184,10 +207,10 @@ def watching(environment: composer.Environment, look: Callable[[], None]) -> Ite
             task.watch = None
 
 
-def _camera(physics: Any, camera: str | int) -> int:
-    names = [physics.model.id2name(i, 'camera') for i in range(physics.model.ncam)]
+def _camera(model: Any, camera: str | int) -> int:
+    names = [model.camera(i).name for i in range(model.ncam)]
     if not isinstance(camera, str):
-        if not -1 <= operator.index(camera) < len(names):
+        if not -1 <= camera < len(names):
             raise ValueError(f'camera is {camera}; expected -1 to {len(names) - 1}')
         return int(camera)
     if camera and camera in names:
