@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from unittest import mock
 
@@ -597,6 +598,46 @@ class PlotTerrainTest(FolderTest):
         self.assert_only()
 
 
+DM_CONTROL_FIRST = 'from dm_control import composer'  # it chooses GLFW
+NO_EGL = 'import ctypes.util; ctypes.util.find_library = lambda name: None'
+NO_DRIVER = {'__EGL_VENDOR_LIBRARY_DIRS': '/nowhere'}
+# For programs in child processes.
+PICTURES = f"""
+import gc, os, signal, threading
+from concurrent.futures import ThreadPoolExecutor
+from unittest import mock
+import mujoco
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+
+dm = dm_mujoco.Physics.from_xml_string(
+    '<mujoco><worldbody><light pos="0 0 3"/><geom size=".3"/></worldbody></mujoco>')
+# Before trl_suite.
+from trl_suite import rendering, suite
+
+def make(id_={GAPS!r}):
+    environment = suite.make(id_, {{'random': 1}})
+    environment.reset()
+    return environment
+
+def elsewhere(function):
+    found = []
+    thread = threading.Thread(target=lambda: found.append(function()))
+    thread.start()
+    thread.join()
+    return found[0]
+
+def picture():
+    return rendering.frame(one, height=48, width=64)
+
+def direct(camera_id=0, **options):
+    return one.physics.render(48, 64, camera_id=camera_id, **options)
+
+def same(*pictures):
+    return pictures[0].std() > 10 and all((each == pictures[0]).all() for each in pictures)
+"""
+
+
 def run_headless(program, variables):
     gl = ('DISPLAY', 'WAYLAND_DISPLAY', 'MUJOCO_GL', 'PYOPENGL_PLATFORM')
     rest = {name: value for name, value in os.environ.items() if name not in gl}
@@ -604,6 +645,112 @@ def run_headless(program, variables):
         [sys.executable, '-W', 'ignore', '-c', program], capture_output=True, text=True,
         env={**rest, **variables}, timeout=60, check=False,
     )  # fmt: skip
+
+
+class ThreadTest(parameterized.TestCase):
+    """An environment may be drawn, closed and freed in any thread; nothing is printed."""
+
+    @parameterized.named_parameters(
+        ('frame', 'print(same(elsewhere(picture), picture(), elsewhere(picture)))'),
+        ('physics_render', 'print(same(elsewhere(direct), direct(), elsewhere(direct)))'),
+        ('closed_here', 'elsewhere(picture); one.close(); print(True)'),
+        ('closed_elsewhere', 'picture(); elsewhere(one.close); print(True)'),
+        ('closed_by_a_third', 'elsewhere(picture); elsewhere(one.close); print(True)'),
+        (
+            'collected_elsewhere',
+            "picture(); one.cycle, one = one, None; elsewhere(gc.collect); print(True)",
+        ),
+        ('at_exit', 'elsewhere(picture); print(True)'),
+        (
+            'at_exit_in_a_living_thread',
+            """
+            drawn = threading.Event()
+            def stay():
+                picture()
+                drawn.set()
+                threading.Event().wait()
+            threading.Thread(target=stay, daemon=True).start()
+            print(drawn.wait(50))
+            """,
+        ),
+        (
+            'many_in_a_pool',
+            """
+            environments = [make() for _ in range(4)]
+            def look(environment):
+                return rendering.frame(environment, 48, 64)
+            with ThreadPoolExecutor(3) as pool:
+                pictures = [each for _ in range(3) for each in pool.map(look, environments)]
+                list(pool.map(lambda each: each.close(), environments))
+            print(same(picture(), *pictures))
+            """,
+        ),
+        (
+            'freed_while_another_is_drawn',
+            """
+            class Free:
+                def draw(self, context, rect):
+                    two.close()
+            before, two = direct(), make()
+            rendering.frame(two)
+            print(same(before, direct(overlays=[Free()]), direct()))
+            """,
+        ),
+        ('between_those_of_dm_control', 'print(same(dm.render(), (picture(), dm.render())[1]))'),
+        (
+            'height_field',
+            """
+            one = make('PD_Biped3D_Imitate-Hills-v0')
+            assert one.physics.model.nhfield
+            elsewhere(picture)
+            one.reset()  # uploads it
+            print(same(picture(), elsewhere(picture)))
+            """,
+        ),
+        (
+            'half_a_context',
+            """
+            with mock.patch('mujoco.MjrContext', side_effect=mujoco.FatalError('no memory')):
+                for draw in picture, direct, picture:
+                    try:
+                        draw()
+                    except RuntimeError as error:
+                        assert str(error).startswith('cannot render: '), error
+                        assert 'no memory' in str(error), error
+            gc.collect()
+            print(same(picture(), elsewhere(picture)))
+            """,
+        ),
+        (
+            'forked',
+            """
+            one = make('PD_Biped3D_Imitate-Hills-v0')
+            picture()
+            child = os.fork()
+            if child == 0:
+                signal.alarm(50)
+                one.reset()
+                try:
+                    direct()
+                except RuntimeError as error:
+                    assert 'cannot render after a fork' in str(error), error
+                    one = None
+                    gc.collect()
+                    raise SystemExit
+            print(os.waitpid(child, 0)[1] == 0 and same(picture()))
+            """,
+        ),
+    )  # fmt: skip
+    def test_any_thread(self, program):
+        if 'fork' in program and not hasattr(os, 'fork'):
+            self.skipTest('no fork here')
+        first = 'dm.render()' if 'dm.' in program else ''
+        begin = PICTURES.replace('# Before trl_suite.', first)
+        done = run_headless(
+            f'{begin}\none = make()\n{textwrap.dedent(program)}',
+            {'MUJOCO_GL': 'egl', 'NUMBA_DISABLE_JIT': '1'},
+        )
+        self.assertEqual((done.returncode, done.stderr, done.stdout), (0, '', 'True\n'))
 
 
 class MissingPartsTest(FolderTest):
@@ -673,18 +820,31 @@ print(os.waitpid(child, 0)[1], rendering.frame(environment).std() > 10)
         self.assertRegex(lines[0], "cannot render after a fork: .* 'spawn'$")
         self.assertEqual(lines[1:], [lines[0], 'closed', '0 True'])
 
-    def test_dm_control_imported_first(self):
-        # It then has chosen GLFW, which finds no display.
+    @parameterized.parameters(
+        (DM_CONTROL_FIRST, {}, 'True'),
+        (NO_EGL, {}, 'cannot render: .* MUJOCO_GL is not set'),
+        (f'{DM_CONTROL_FIRST}; {NO_EGL}', {}, 'cannot render: .* MUJOCO_GL is not set'),
+        (DM_CONTROL_FIRST, NO_DRIVER, "cannot render: .* MUJOCO_GL is 'egl'"),
+    )
+    def test_without_a_display(self, first, variables, expected):
         program = f"""
-from dm_control import composer
+{first}
 from trl_suite import rendering, suite
 environment = suite.make({GAPS!r})
 environment.reset()
-print(rendering.frame(environment).std() > 10)
-print(environment.physics.render().std() > 10)
+draw = environment.physics.render, lambda: rendering.frame(environment)
+for each in 2 * draw:
+    try:
+        print(each().std() > 10)
+    except RuntimeError as error:
+        print(error)
 """
-        done = run_headless(program, {})
-        self.assertEqual((done.returncode, done.stderr, done.stdout), (0, '', 'True\nTrue\n'))
+        done = run_headless(program, {**variables, 'NUMBA_DISABLE_JIT': '1'})
+        self.assertEqual((done.returncode, done.stderr), (0, ''))
+        lines = done.stdout.splitlines()
+        self.assertLen(lines, 4)
+        for line in lines:
+            self.assertRegex(line, expected)
 
 
 if __name__ == '__main__':

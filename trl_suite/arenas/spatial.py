@@ -348,7 +348,7 @@ class SpatialArena(composer.Arena):
         """Uploads a new height field to the rendering contexts of the physics, if there are any."""
         try:
             contexts = self._physics and self._physics._contexts
-            if not contexts or self._physics.model.ptr is not model:
+            if not contexts or contexts.gl.terminated or self._physics.model.ptr is not model:
                 return
             with contexts.gl.make_current() as gl:
                 gl.call(mujoco.mjr_uploadHField, model, contexts.mujoco.ptr, 0)

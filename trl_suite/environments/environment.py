@@ -12,12 +12,16 @@ from dm_control.composer import observation as composer_observation
 from dm_env import specs
 
 from trl_suite.environments import arguments, states
+from trl_suite.rendering import contexts
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors, interrupts
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
 _NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
+
+
+contexts.install()  # pictures of `physics.render`, too, may come from any thread
 
 
 class Environment(composer.Environment):

@@ -19,9 +19,7 @@ to files, and makes pictures without OpenGL.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +35,6 @@ if TYPE_CHECKING:  # plots of terrain need no engine
 
 
 Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
-_drawn_by: set[int] = set()  # id of the process that has rendered; a forked child has another id
 
 
 def frame(
@@ -230,42 +227,11 @@ def check_gl(physics: Any) -> None:
     Raises:
       RuntimeError: no OpenGL library works, or this process was forked from one that has rendered.
     """
-    process = os.getpid()
-    if _drawn_by and process not in _drawn_by:
-        raise RuntimeError(
-            'cannot render after a fork: the OpenGL context belongs to the parent process, which has '
-            "rendered. Render there, or use multiprocessing's start method 'spawn'"
-        )
-    try:
-        with interrupts.postponed():  # half a context would print a traceback when it is freed
-            _use_chosen_library()
-            _ = physics.contexts
-            _drawn_by.add(process)
-    # Errors depend on the library: RuntimeError, AttributeError, FatalError, GLError.
-    except Exception as error:
-        raise RuntimeError(no_gl(error)) from error
+    from trl_suite.rendering import contexts
 
-
-def _use_chosen_library() -> None:
-    """Makes dm_control use the library that MUJOCO_GL now names, if its current one does not work.
-
-    dm_control reads the variable when it is imported. If it is imported before this package, as
-    with sorted imports, it uses GLFW, even if there is no display.
-    """
-    render = sys.modules.get('dm_control._render')
-    if getattr(render, 'BACKEND', None) != 'glfw' or _display():
-        return
-    if os.environ.get('MUJOCO_GL') not in ('egl', 'osmesa'):
-        # GLFW would warn, and leave an incomplete context that fails again at exit.
-        raise RuntimeError('GLFW finds no display')
-    assert render is not None
-    importlib.reload(render)
-
-
-def _display() -> bool:
-    return sys.platform != 'linux' or bool(
-        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
-    )
+    contexts.install()
+    with interrupts.postponed():  # half a context would print a traceback when it is freed
+        _ = physics.contexts
 
 
 def no_gl(error: Exception) -> str:
