@@ -846,6 +846,10 @@ for each in 2 * draw:
         for line in lines:
             self.assertRegex(line, expected)
 
+    def test_without_a_driver(self):
+        done = run_headless('import trl_suite.suite', {'MUJOCO_GL': 'egl', **NO_DRIVER})
+        self.assertRegex(done.stderr, "RuntimeError: cannot render: .* MUJOCO_GL is 'egl'.*disable")
+
 
 if __name__ == '__main__':
     absltest.main()

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 try:
-    import dm_control  # noqa: F401
+    import dm_control
 except ModuleNotFoundError as error:
     from trl_suite.util.libraries import DM_CONTROL, missing
 
     raise ModuleNotFoundError(missing('dm_control', DM_CONTROL), name=error.name) from error
+try:
+    import dm_control._render  # noqa: F401  loads the OpenGL library that MUJOCO_GL names
+except (AttributeError, ImportError) as error:
+    from trl_suite.rendering import no_gl
+
+    raise RuntimeError(no_gl(error)) from error
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
