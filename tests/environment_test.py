@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
+from dm_control.suite.wrappers import action_noise, action_scale, mujoco_profiling, pixels
 from dm_env import test_utils
 from helpers import (
     KINDS,
@@ -521,7 +522,10 @@ class EpisodeTest(parameterized.TestCase):
     def test_the_environment_has_the_limit_of_its_id(self):
         self.assertEqual(suite.make(GAPS).step_limit, 256)
 
-    @parameterized.parameters(({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.5}, 15))
+    @parameterized.parameters(
+        ({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.1}, 3), ({'time_limit': 0.5}, 15),
+        ({'time_limit': 1}, 30), ({'time_limit': 4.0}, 120), ({'time_limit': 0.11}, 4),
+    )  # fmt: skip
     def test_truncation_is_not_a_failure(self, options, steps):
         environment = held(**options)
         count, step = self.length(environment)
@@ -765,6 +769,36 @@ class ConstructionTest(parameterized.TestCase):
     def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.make(GAPS, options)
+
+    @parameterized.parameters(True, 1.0, '1', b'1', np.random.default_rng(1))
+    def test_other_types_of_seeds_are_rejected(self, seed):
+        with self.assertRaisesRegex(TypeError, r'random is .*; expected a seed, an integer'):
+            suite.make(GAPS, {'random': seed})
+
+    def test_wrappers_of_dm_control(self):
+        environment = suite.load('plaid', 'biped_gaps', {'random': 1})
+        for wrapper, options in (
+            (action_noise, {}), (action_scale, {'minimum': -2.0, 'maximum': 2.0}),
+            (mujoco_profiling, {}), (pixels, {'render_kwargs': {'height': 32, 'width': 32}}),
+        ):  # fmt: skip
+            environment = wrapper.Wrapper(environment, **options)
+            environment.reset()
+            time_step = environment.step(np.zeros(environment.action_spec().shape))
+            self.assertTrue(0 < time_step.reward <= 1, wrapper.__name__)
+
+    def test_images_show_the_reward(self):
+        """The body turns green with the fourth power of the reward; the ground does not."""
+        environment = suite.load('plaid', 'biped_gaps', {'random': 1}, visualize_reward=True)
+        environment = pickle.loads(pickle.dumps(environment))
+        environment.reset()
+        model = environment.physics.model
+        begun = model.geom_rgba.copy()
+        share = environment.step(environment.task.clip_action(0)).reward ** 4
+        moving = model.body_weldid[model.geom_bodyid] > 0
+        expected = (1 - share) * begun[moving, :3] + share * np.array([0, 0.5, 0.3])
+        np.testing.assert_allclose(model.geom_rgba[moving, :3], expected, rtol=1e-6)
+        np.testing.assert_array_equal(model.geom_rgba[~moving], begun[~moving])
+        self.assertGreater(share, 0.05)
 
     def test_no_compilation_after_construction(self):
         environment = suite.make(GAPS, {'random': 0})

@@ -206,6 +206,30 @@ class SingleTest(Same, parameterized.TestCase):
             self.assertTrue((double[0].astype(np.float32) == single[0]).all())
         self.assertEqual(SuiteEnv(GAPS, dtype=np.float64).action_space.dtype, np.float64)
 
+    def test_a_fall_in_the_step_of_the_limit(self):
+        """Gymnasium's wrapper sets both flags; so do all environments."""
+        idle = np.zeros(11, np.float32)
+        environment = suite.make(GAPS, {'random': 1})
+        environment.reset()
+        steps = 1
+        while not environment.step(idle).last():
+            steps += 1
+        self.assertLess(steps, 256)
+        limited = {'task_kwargs': {'step_limit': steps}}
+        id_ = f'trl_suite/{GAPS}'
+        for env, seed in (
+            (gymnasium.make(id_, max_episode_steps=steps), 1), (gymnasium.make(id_, **limited), 1),
+            (SuiteEnv(GAPS, max_episode_steps=steps), 1),
+            *((gymnasium.make_vec(
+                id_, 1, vectorization_mode=mode, max_episode_steps=steps, **options), [1])
+              for mode, options in (('sync', {}), (None, {}), (None, {'autoreset_mode': 'SameStep'}))),
+        ):  # fmt: skip
+            env.reset(seed=seed)
+            actions = idle if seed == 1 else idle[None]
+            flags = [env.step(actions)[2:4] for _ in range(steps)]
+            self.assertEqual([*map(bool, flags[-1])], [True, True], env)
+            self.assertFalse(np.any(flags[:-1]))
+
     def test_falls_terminate_and_limits_truncate(self):
         """A fall terminates; the own limit truncates, once."""
         env = gymnasium.make(f'trl_suite/{FLAT}', task_kwargs={'step_limit': 3})

@@ -1,6 +1,7 @@
 """Tests of what users make: characters from files, terrain from data, tasks from parts."""
 
 import contextlib
+import copy
 import math
 import pathlib
 import pickle
@@ -16,7 +17,7 @@ import numpy as np
 import trimesh
 from absl.testing import absltest, parameterized
 
-from trl_suite import characters, cli, engine, gym, motion, suite, terrain
+from trl_suite import characters, cli, engine, gym, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk.task import Walk
@@ -777,6 +778,35 @@ class TaskTest(parameterized.TestCase):
             environment = suite.make('PD_Biped2D_Flat-v0', options)
             environment.reset()
             environment.step(np.zeros(11))
+
+
+class WorkingFolderTest(Folder):
+    """What was read when an environment was built is not read again."""
+
+    @parameterized.parameters('clip', 'terrain', 'controller')
+    def test_copies_in_another_folder(self, part):
+        motion.load('biped2d_walk').save(self.folder / 'walk.npz')
+        (self.folder / 'gaps.json').write_text(
+            '{"Type": "var2d_gaps", "Params": [{"GapSpacingMin": 2, "GapSpacingMax": 3}]}'
+        )
+        policies.save(
+            policies.reference('PD_Biped3D_LLC_General_Step-v0'), self.folder / 'controller.npz'
+        )
+        with contextlib.chdir(self.folder):
+            options = {}
+            if part == 'controller':
+                spec, options = 'PD_Biped3D_HLC_Soccer-v0', {'controller': 'controller.npz'}
+                environment = suite.make(spec, options)
+            else:
+                parts = {part: {'clip': 'walk.npz', 'terrain': 'gaps.json'}[part]}
+                environment = suite.build('biped2d', **parts)
+                spec = suite.combine('biped2d', **parts)
+            many = VectorEnvironment(spec, 2, 1, task_kwargs=options)
+        environment.reset()
+        many.reset()
+        state = copy.deepcopy(environment).get_state()
+        self.assertEqual(state['made_for'], environment.get_state()['made_for'])
+        self.assertEqual(many.render(0, height=32, width=32).shape, (32, 32, 3))
 
 
 class ExampleTest(Folder):

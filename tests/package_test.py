@@ -123,6 +123,14 @@ class ImportTest(absltest.TestCase):
             seconds.append(float(out))
         self.assertLess(min(seconds), 1.5)
 
+    def test_a_python_without_docstrings(self):
+        done = subprocess.run(
+            [sys.executable, '-OO', '-c', 'from trl_suite import suite; e = suite.make('
+             f'"{TRAINED}"); e.reset(); print(e.step([0] * 20).reward > 0)'],
+            capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+        self.assertEqual(done.stdout, 'True\n', done.stderr)
+
     def test_suite_prints_nothing_and_makes_no_context(self):
         code = """
             import trl_suite.suite

@@ -19,6 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
+from trl_suite.environments import arguments
 from trl_suite.gym import SuiteEnv
 from trl_suite.vector import VectorEnvironment
 
@@ -45,7 +46,7 @@ class StableBaselinesTest(parameterized.TestCase):
         ours = SuiteVecEnv(GAPS, 3, 2, flat_observation=flat, step_limit=LIMIT)
         self.assertEqual(ours.observation_space, theirs.observation_space)
         self.assertEqual(ours.action_space, theirs.action_space)
-        self.assertEqual(ours.seed(7), theirs.seed(7))
+        theirs._seeds = ours.seed(7)
         self.compare(ours.reset(), theirs.reset())
         self.assertEqual(ours.reset_infos, theirs.reset_infos)
         random, falls, limits = np.random.default_rng(0), 0, 0
@@ -93,11 +94,18 @@ class StableBaselinesTest(parameterized.TestCase):
         envs = SuiteVecEnv(FLAT, 2, 1, seed=[4, 5])
         first = envs.reset()
         self.assertTrue((envs.reset() != first).any(1).all())  # the streams continue
-        envs.seed(4)
-        np.testing.assert_array_equal(envs.reset(), first)
         envs.seed(2**32 - 1)  # as SB3 may draw it
         envs.reset()
-        np.testing.assert_array_equal(envs.environment.seeds, [2**32 - 1, 0])
+
+    def test_successive_seeds_have_no_episodes_in_common(self):
+        envs = SuiteVecEnv(GAPS, 8, 1)
+
+        def first(seed):
+            self.assertEqual(envs.seed(seed), arguments.all_seeds(seed, 8).tolist())
+            return envs.reset()
+
+        np.testing.assert_array_equal(first(3), SuiteVecEnv(GAPS, 8, 1, seed=3).reset())
+        self.assertEqual(len(np.unique(np.concatenate([first(3), first(4)]), axis=0)), 16)
 
     def test_render(self):
         envs = SuiteVecEnv(FLAT, 3, 1, seed=0, render_mode='rgb_array', render_kwargs=SMALL)

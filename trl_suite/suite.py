@@ -21,6 +21,7 @@ from typing import Any
 
 from trl_suite import actuation as actuation_models
 from trl_suite import characters, motion, policies
+from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import DIMENSIONS, build_task
@@ -48,6 +49,7 @@ def load(
     task_name: str,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
+    visualize_reward: bool = False,
 ) -> Environment:
     """Loads an environment by family and task, as `dm_control.suite.load` does.
 
@@ -56,6 +58,7 @@ def load(
       task_name: one of `TASKS_BY_DOMAIN[domain_name]`.
       task_kwargs: `random` (seed), `time_limit` (s), `step_limit`, and the task's own options.
       environment_kwargs: options of `Environment`, e.g. `flat_observation`.
+      visualize_reward: whether images show the reward, see `Environment`.
 
     Raises:
       ValueError: unknown names or options; the message has the closest matches.
@@ -68,6 +71,8 @@ def load(
                 f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name]
             )
         )
+    environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
+    environment_kwargs.setdefault('visualize_reward', visualize_reward)
     spec = catalogue.BY_TASK[domain_name, task_name]
     return build_environment(spec, task_kwargs, environment_kwargs)
 
@@ -184,6 +189,9 @@ def combine(
         raise TypeError(f'task is {task!r}; expected a title, a TaskType, or a class or function')
     if terrain is None:
         terrain = 'plane' if figure.spatial else 'flat'
+    if isinstance(clip, str) and clip.endswith('.npz'):  # read once: the working folder may change
+        steps = type_ is not None and type_.motion is motion.Steps
+        clip = motion.load_steps(clip) if steps else motion.load(clip)
     if clip is not None and not isinstance(clip, str):
         own['clip'], clip = clip, clip.name
     ground = terrain if isinstance(terrain, str) else 'terrain'
@@ -263,9 +271,9 @@ def build_environment(
     environment_kwargs: Mapping[str, Any] | None,
 ) -> Environment:
     """Builds an environment from its spec; see `load` for the other arguments."""
-    task_kwargs = errors.options('task_kwargs', task_kwargs)
+    task_kwargs = arguments.absolute(errors.options('task_kwargs', task_kwargs))
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
-    known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
+    known = [*_ENVIRONMENT_OPTIONS, 'flat_observation', 'visualize_reward']
     for name in environment_kwargs:
         if name not in known:
             raise ValueError(errors.unknown('option of an environment', name, known))

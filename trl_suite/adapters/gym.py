@@ -17,7 +17,6 @@ environment's step limit truncates it; `info` has 'fell', 'diverged', 'distance'
 from __future__ import annotations
 
 import inspect
-import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -53,6 +52,9 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
 
     `reset(seed=s)` starts the same episode as the first reset of
     `suite.make(id, task_kwargs={'random': s})`; a reset without a seed starts the next episode.
+
+    `truncated` is whether a step reached the step or time limit, also if the episode failed in this
+    step, as for `gymnasium.wrappers.TimeLimit`.
     """
 
     metadata = METADATA
@@ -99,9 +101,11 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         """Starts an episode, seeded if `seed`, in [0, 2**32), is given; there are no options."""
         self._check_open()
         if seed is not None:
-            seed = operator.index(seed)
+            if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+                raise TypeError(f'seed is {seed!r}; expected an integer in [0, 2**32)')
             if not 0 <= seed < 2**32:
                 raise ValueError(f'seed is {seed}; expected an integer in [0, 2**32)')
+            seed = int(seed)
             self.environment.random_state.seed(seed)
         super().reset(seed=seed)
         time_step = self.environment.reset()
@@ -117,9 +121,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         last = time_step.last()
         terminated = last and time_step.discount == 0
         self._running = not last
-        observation, truncated = self._observation(time_step.observation), last and not terminated
-        info = flat(self.environment.info)
-        return observation, float(time_step.reward), terminated, truncated, info
+        observation, info = self._observation(time_step.observation), flat(self.environment.info)
+        return observation, float(time_step.reward), terminated, self.environment.at_limit, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Draws the current state, (h, w, 3) uint8; None if render_mode is None."""
@@ -150,7 +153,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     With the same seeds, simulation i equals environment i of a `SyncVectorEnv` of `SuiteEnv`.
     `reset(seed=[s0, s1, ...])` seeds every simulation. With `reset(seed=s)` simulation i gets the
     i-th number of `numpy.random.SeedSequence(s).generate_state(n)` as its seed, not s + i, so that
-    successive seeds have no episodes in common.
+    successive seeds have no episodes in common. `truncated` is that of `SuiteEnv`.
     """
 
     def __init__(
@@ -208,7 +211,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Steps every simulation; arguments and errors are those of `VectorEnvironment.step`."""
-        observation, reward, terminated, truncated, info = self.environment.step(actions)
+        observation, reward, terminated, _, info = self.environment.step(actions)
         result: Info = {}
         ended = info.pop('ended', np.zeros(1, bool))
         if ended.any():  # and reset in the same step
@@ -218,7 +221,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             result |= {'final_obs': np.fromiter(last, object), '_final_obs': ended}
             info = self.environment.info
         result |= masked(flat(info), np.ones(self.num_envs, bool))
-        return observation, reward, terminated, truncated, result
+        return observation, reward, terminated, self.environment.at_limit, result
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Draws every simulation; None if render_mode is None."""

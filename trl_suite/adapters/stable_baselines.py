@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.adapters.gym import action_space, flat, observation_space, rendered
+from trl_suite.environments import arguments
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
 
@@ -34,8 +35,7 @@ class SuiteVecEnv(VecEnv):
     """Many simulations on threads; a simulation whose episode ends is reset in the same step.
 
     The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_NAME' for each reward
-    term and 'TimeLimit.truncated'; if its episode ended, also 'terminal_observation'. After
-    `seed(s)`, simulation i has the seed s + i at the next reset, as everywhere in Stable-Baselines3.
+    term and 'TimeLimit.truncated'; if its episode ended, also 'terminal_observation'.
 
     Attributes:
       environment: the wrapped `trl_suite.environments.vector.VectorEnvironment`.
@@ -78,9 +78,19 @@ class SuiteVecEnv(VecEnv):
             action_space((len(self.environment.action_map),), np.float32),
         )
 
+    def seed(self, seed: int | None = None) -> list[int]:
+        """Sets the seeds for the next reset; they are derived from one as in the constructor.
+
+        Successive seeds have no episodes in common, as they would with the seeds s + i that
+        Stable-Baselines3 gives to environments of its own.
+        """
+        seeds: list[int] = arguments.all_seeds(seed, self.num_envs).tolist()
+        self._seeds = [*seeds]
+        return seeds
+
     def reset(self) -> Any:
         """Starts an episode in every simulation; options of `set_options` are ignored."""
-        seeds = None if None in self._seeds else [int(seed) % 2**32 for seed in self._seeds]  # type: ignore[arg-type]
+        seeds = [seed for seed in self._seeds if seed is not None] or None
         self._reset_seeds()
         self._reset_options()
         observation = self.environment.reset(seed=seeds)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite.util import errors
+
+TIME_ERROR = 1e-6  # s; more than the error of a sum of physics steps, less than one of them
 
 
 class OneThread:
@@ -28,6 +31,15 @@ class OneThread:
 
     def __exit__(self, *error: object) -> None:
         self._lock.release()
+
+
+def absolute(value: Any) -> Any:
+    """Returns options whose files have absolute paths: copies may be made in other folders."""
+    if isinstance(value, str) and value.endswith(('.npz', '.json')):
+        return os.path.abspath(value)
+    if isinstance(value, Mapping):
+        return {name: absolute(each) for name, each in value.items()}
+    return value
 
 
 def check_step_limit(value: Any) -> int | None:

@@ -16,6 +16,7 @@ from trl_suite.rendering import contexts
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors, interrupts
 
+HIGHLIGHT = (0.0, 0.5, 0.3)  # colour of a character with a reward of 1, as in dm_control.suite
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
 _NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
@@ -35,6 +36,9 @@ class Environment(composer.Environment):
     step or time limit ended the episode.
 
     Only one thread may use an environment at a time; a second one is rejected.
+
+    Attributes:
+      at_limit: whether the last step reached the step or time limit, also if it failed.
     """
 
     _task: Task
@@ -47,6 +51,7 @@ class Environment(composer.Environment):
         time_limit: float = float('inf'),
         random: int | Sequence[int] | np.random.RandomState | None = None,
         flat_observation: bool = False,
+        visualize_reward: bool = False,
     ) -> None:
         """Compiles the task.
 
@@ -56,22 +61,28 @@ class Environment(composer.Environment):
           time_limit: simulated time in s after which an episode is truncated.
           random: seed; drawn from the operating system if None.
           flat_observation: return all blocks as one vector, under the key 'observations'.
+          visualize_reward: whether images show the reward, as in `dm_control.suite`: moving bodies
+            turn green as it rises to 1.
 
         Raises:
-          ValueError: a limit that is not positive, an invalid seed, a `flat_observation` that is no
-            bool, or substep hooks.
+          ValueError: a limit that is not positive, an invalid seed, a `flat_observation` or
+            `visualize_reward` that is no bool, or substep hooks.
           TypeError: a seed that is not an integer.
         """
         step_limit = arguments.check_step_limit(step_limit)
         time_limit = arguments.check_time_limit(time_limit)
-        if isinstance(random, (float, str, bytes)):
-            raise TypeError(f'random is {random!r}; expected a seed, an integer in [0, 2**32)')
+        if isinstance(random, (bool, float, str, bytes, np.random.Generator)):
+            raise TypeError(
+                f'random is {random!r}; expected a seed, an integer in [0, 2**32), or a '
+                'numpy.random.RandomState'
+            )
         if isinstance(random, int) and not 0 <= random < 2**32:
             raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
         errors.check_kind('flat_observation', flat_observation, bool)
+        errors.check_kind('visualize_reward', visualize_reward, bool)
         self._flat_observation = flat_observation
         self._step_limit = step_limit
-        self._steps = 0
+        self._steps, self.at_limit = 0, False
         self.one_thread = arguments.OneThread()  # entered by methods that use the simulation
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
@@ -81,21 +92,29 @@ class Environment(composer.Environment):
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
         )
+        task.random = self._random_state  # as tasks of dm_control.suite have it
         # The model is compiled already. Otherwise, composer would compile it again at the first
         # reset.
         self._mjcf_never_compiled = False
+        self._colours = _colours(self._physics.model) if visualize_reward else None
         self._signature = states.signature(task, 'single environment')
         self._parts = tuple(task.blocks.items())
         self._action_map = task.action_map
         # Whether there are hooks to call before or after a step. Checking them takes time.
-        self._hooked = bool(
-            self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
-        )
+        self._hooked = any(self._entity_hooks(name) for name in ('before_step', 'after_step'))
         for name in _SUBSTEP_HOOKS:
-            hook = getattr(self._hooks, f'_{name}')
             overridden = getattr(type(task), name) is not getattr(composer.Task, name)
-            if hook.entity_hooks or overridden:
+            if overridden or self._entity_hooks(name):
                 raise ValueError(f'the task or an entity in it has a {name} hook: {_NO_SUBSTEPS}')
+
+    def _entity_hooks(self, name: str) -> list[Callable[..., None]]:
+        """Returns the hooks of a name that entities override.
+
+        dm_control compares bytecode, which differs from what it expects with `python -OO`.
+        """
+        empty = getattr(composer.Entity, name)
+        hooks = getattr(self._hooks, f'_{name}').entity_hooks
+        return [hook for hook in hooks if getattr(hook, '__func__', hook) is not empty]
 
     def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
         self._check_open()
@@ -121,8 +140,10 @@ class Environment(composer.Environment):
         """
         with self.one_thread:
             self._check_open()
-            self._steps = 0
+            self._steps, self.at_limit = 0, False
             self._reset_next_step = False
+            if self._colours is not None:
+                self._show_reward(0.0)
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
             if self._extra_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
@@ -159,13 +180,23 @@ class Environment(composer.Environment):
             self._observation_updater.update()
         observation = self._observe()
         failed = bool(task.failed[0])
-        self._reset_next_step = (
-            failed
-            or (self._step_limit is not None and self._steps >= self._step_limit)
-            or (self._time_limit < np.inf and self._physics.time() >= self._time_limit)
+        self.at_limit = (self._step_limit is not None and self._steps >= self._step_limit) or bool(
+            self._time_limit < np.inf
+            and self._physics.time() >= self._time_limit - arguments.TIME_ERROR
         )
+        self._reset_next_step = failed or self.at_limit
+        if self._colours is not None:
+            self._show_reward(float(task.reward[0]))
         step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
+
+    def _show_reward(self, reward: float) -> None:
+        assert self._colours is not None
+        geoms, colours = self._colours
+        share = min(max(reward, 0.0), 1.0) ** 4
+        self._physics.model.geom_rgba[geoms, :3] = (
+            share * np.array(HIGHLIGHT) + (1 - share) * colours
+        )
 
     def close(self) -> None:
         """Frees the simulation and the task. A second call does nothing."""
@@ -304,3 +335,12 @@ class Environment(composer.Environment):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.set_state(state)
+
+
+def _colours(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the geoms of moving bodies, (g,), and their colours, (g, 3)."""
+    geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+    colours, materials = model.geom_rgba[geoms, :3].copy(), model.geom_matid[geoms]
+    own = materials >= 0
+    colours[own] = model.mat_rgba[materials[own], :3]
+    return geoms, colours

@@ -38,7 +38,7 @@ class Step(NamedTuple):
       observation: (n, size), or a dict of blocks (n, ...) in order.
       reward: (n,).
       terminated: whether the episode failed, (n,) bool.
-      truncated: whether the step or time limit ended the episode, (n,) bool.
+      truncated: whether the step or time limit ended the episode, not a failure, (n,) bool.
       info: arrays (n, ...) by name: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), ...;
         with autoreset 'same_step' also 'ended' and, if an episode ended, 'final_observation'.
     """
@@ -63,6 +63,7 @@ class VectorEnvironment:
     Attributes:
       num_envs: number of simulations n.
       seeds: seed of each simulation, (n,) uint32.
+      at_limit: whether the last step reached the step or time limit, also if it failed, (n,) bool.
       blocks: slice of each observation block in the flat vector.
       action_map: the map from actions to physical units.
       control_timestep: duration of a step, s.
@@ -115,7 +116,7 @@ class VectorEnvironment:
         self.spec = spec_of(environment)
         self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
         self.flat_observation = flat_observation
-        self._task_kwargs = options = errors.options('task_kwargs', task_kwargs)
+        self._task_kwargs = options = arguments.absolute(errors.options('task_kwargs', task_kwargs))
         if 'random' in options:
             raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
         own = (
@@ -130,6 +131,7 @@ class VectorEnvironment:
         self.blocks, self.action_map = dict(task.blocks), task.action_map
         self.control_timestep: float = task.control_timestep
         self.seeds = self._simulations.seeds
+        self.at_limit = np.zeros(self.num_envs, bool)
         self._picture: Environment | None = None
         self.seed(seed)
 
@@ -234,12 +236,12 @@ class VectorEnvironment:
             resting[env_ids] = False
             for each in (reward, terminated, *info.get('reward_terms', {}).values()):
                 each[resting] = 0
-        truncated = np.zeros(self.num_envs, bool)
+        self.at_limit = truncated = np.zeros(self.num_envs, bool)
         if self.step_limit is not None:
             truncated[asked] = steps[asked] >= self.step_limit
         if self.time_limit < np.inf:
-            truncated[asked] |= world.time[asked] >= self.time_limit
-        truncated &= ~terminated
+            truncated[asked] |= world.time[asked] >= self.time_limit - arguments.TIME_ERROR
+        truncated = truncated & ~terminated
         ended[asked] = terminated[asked] | truncated[asked]
         if self.autoreset == 'same_step':
             info['ended'] = ended.copy()

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from trl_suite import terrain as terrains
+
 STEP_LIMIT = 256  # steps after which an episode is truncated
 _MAPPINGS = ('options', 'own')
 
@@ -64,10 +66,15 @@ class EnvSpec:
         return self.own.get(name, getattr(self, name))
 
     def with_terrain(self, terrain: Any) -> EnvSpec:
-        """Returns a copy with another terrain: anything that `trl_suite.terrain.load` takes."""
+        """Returns a copy with another terrain: anything that `trl_suite.terrain.load` takes.
+
+        A file is read once: copies may be made where its name leads nowhere.
+        """
         own = {name: value for name, value in self.own.items() if name != 'terrain'}
+        if not isinstance(terrain, str) or terrain.endswith(('.json', '.txt')):
+            own['terrain'] = terrains.load(terrain)
         if not isinstance(terrain, str):
-            own['terrain'], terrain = terrain, 'terrain'
+            terrain = 'terrain'
         return dataclasses.replace(self, terrain=terrain, own=MappingProxyType(own))
 
 
