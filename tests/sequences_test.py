@@ -345,6 +345,9 @@ class RunTest(parameterized.TestCase):
         (self.folder / '.result.json.lock').write_text('1234')
         self.assertLen(self.run_short(Keeper())['scores'], 3)
         self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+        (self.folder / 'result.stage1').mkdir()  # it was killed after its last stage
+        self.run_short(Keeper())
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
 
     def test_a_learner_that_exceeds_its_budget_is_refused(self):
         class Greedy(Counter):

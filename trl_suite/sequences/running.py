@@ -151,6 +151,7 @@ def run(
             result['initial'] = scores(sequence, learner.policy(), *test)
             _write(path, result)
         done = len(result['scores'])
+        _forget(path, done)  # the run may have been killed before it did so
         with tqdm.tqdm(
             total=stages, initial=done, unit='stage', disable=None if progress else True
         ) as bar:
@@ -169,10 +170,8 @@ def run(
                 elif isinstance(learner, Resumable):
                     with _folder(_state(path, number + 1)) as folder:
                         learner.save(folder)
-                # This completes the stage; the states of those before are obsolete.
-                _write(path, result)
-                for earlier in range(1, number + 1):
-                    shutil.rmtree(_state(path, earlier), ignore_errors=True)
+                _write(path, result)  # this completes the stage
+                _forget(path, number + 1)
                 bar.update()
         return result
 
@@ -198,6 +197,12 @@ def _resumed(path: pathlib.Path, expected: dict[str, Any], learner: Learner) -> 
 
 def _state(path: pathlib.Path, done: int) -> pathlib.Path:
     return path.with_name(f'{path.stem}.stage{done}')
+
+
+def _forget(path: pathlib.Path, done: int) -> None:
+    """Removes the learner's states before the last of these stages, which are obsolete."""
+    for earlier in range(1, done):
+        shutil.rmtree(_state(path, earlier), ignore_errors=True)
 
 
 @contextlib.contextmanager
