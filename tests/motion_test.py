@@ -577,6 +577,31 @@ class ReaderTest(parameterized.TestCase):
         self.assertAlmostEqual(clip.poses[0, 2], np.pi / 2)
         self.assertLessEqual(np.abs(np.diff(clip.poses[:, 2])).max(), np.pi + 1e-9)
 
+    def test_a_file_of_the_predecessor(self):
+        """Its frames lie under `Motion`, and its root is planar: x, y and an angle."""
+        frames = [[0.1, 1, 2, 3.0, -0.3], [0.2, 1.5, 2.5, 3.5, 0.4], [9, 2, 3, 7.0, 0.5]]
+        content = {'Motion': {'Loop': True, 'Frames': frames}}
+        self.path.write_text(json.dumps(content))
+        clip = motion.read_terrainrl(self.path, ['knee'], [1], 'planar')
+        np.testing.assert_allclose(clip.times, (0, 0.1, 0.3))
+        expected = np.array(frames)[:, 1:]
+        expected[2, 2] -= 2 * np.pi  # frames tell directions, not turns
+        np.testing.assert_allclose(clip.poses, expected)
+        self.assertTrue(clip.loop)
+        with self.assertRaisesRegex(
+            ValueError, 'walk.txt: a motion in the plane; expected a planar'
+        ):
+            motion.read_terrainrl(self.path, ['knee'], [1], 'free')
+        for row, message in (
+            ([0.1, 1, 2, None, 0], 'frame 1, root angle: None'),
+            ([0.1, 1, 2, 0, 'a'], "frame 1, column 4: 'a'"),
+            ([0.1, 1, 2, 0], 'frame 1 has 4 numbers'),
+        ):
+            content['Motion']['Frames'] = [frames[0], row]
+            self.path.write_text(json.dumps(content))
+            with self.assertRaisesRegex(ValueError, f'walk.txt: {message}'):
+                motion.read_terrainrl(self.path, ['knee'], [1], 'planar')
+
     def test_planar_pitch_is_continuous(self):
         pitch = np.linspace(0.5, 12, 30)
         signs = np.where(np.arange(30) % 3, 1, -1)  # a quaternion and its negative are the same

@@ -335,6 +335,28 @@ class FileTest(parameterized.TestCase):
         self.assertEqual(preset.parameters(), terrain.load(path).parameters())
         self.assertIs(terrain.load(preset), preset)
 
+    @parameterized.parameters(
+        'flat', 'gaps', 'steps', 'walls', 'mixed', 'narrow_gaps', 'slopes', 'slopes_gaps', 'slopes_walls',
+        'slopes_steps', 'slopes_mixed', 'cliffs',
+    )  # fmt: skip
+    def test_files_of_the_predecessor(self, kind):
+        """Their types lack the prefix."""
+        defaults = terrain.load({'Type': f'var2d_{kind}'}).parameters()
+        given = {key: value / 2 for key, value in defaults.items()}
+        path = self.write(json.dumps({'Type': kind, 'Params': [given] if given else []}))
+        ground = terrain.load(path)
+        self.assertEqual((ground.type, ground.parameters()), (f'var2d_{kind}', given))
+
+    def test_cliffs_of_the_predecessor_may_have_overlays_of_size_0(self):
+        flat = dict.fromkeys(('BumpHMin', 'BumpHMax'), 0)
+        flat |= dict.fromkeys(('SlopeDeltaRange', 'SlopeDeltaMin', 'SlopeDeltaMax'), 0.0)
+        for extra in ({}, flat):
+            ground = terrain.load({'Type': 'cliffs', 'Params': [{'CliffMiniCountMax': 2, **extra}]})
+            self.assertEqual(ground.parameter_sets, ({'CliffMiniCountMax': 2},))
+        for kind, extra in (('cliffs', {'BumpHMax': 0.1}), ('var2d_cliffs', flat)):
+            with self.assertRaisesRegex(ValueError, "'BumpH.*' has no effect in var2d_cliffs"):
+                terrain.load({'Type': kind, 'Params': [extra]})
+
     @parameterized.parameters({}, {'Params': []}, {'Params': [{}]}, {'GroundWidth': 20})
     def test_defaults(self, **content):
         gaps = terrain.load({'Type': 'var2d_gaps', **content}).parameters()

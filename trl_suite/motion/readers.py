@@ -3,7 +3,9 @@
 Both hold `Frames`, arrays of [duration of the frame in s, root x, y, z, root quaternion wxyz, then
 one number per hinge and a quaternion wxyz per ball joint, in the order of the character file]. They
 differ in `Loop`: a boolean in TerrainRL, 'wrap' or 'none' in DeepMimic, which also centres the
-root, does not accumulate its height over cycles, and may accumulate its heading.
+root, does not accumulate its height over cycles, and may accumulate its heading. Files of
+DeepTerrainRL, the predecessor of TerrainRL, hold the same under `Motion`; their root is planar: x, y
+and its angle.
 
 The files' frame has x forward, y up and z to the right. In the frame of trl_suite,
 (x, y, z) -> (x, -z, y), hinge angles keep their sign: hinges of the files are about +z, those here
@@ -25,7 +27,10 @@ from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
 from trl_suite.util.files import read_json, replacing
 
-_HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
+# Numbers of a frame before the joints, and those of DeepTerrainRL.
+_ROOT: tuple[str, ...] = ('duration', *3 * ('root position',), *4 * ('root quaternion',))
+_PLANAR_ROOT: tuple[str, ...] = ('duration', 'root position', 'root position', 'root angle')
+_HEADER = len(_ROOT)
 _FLAT = 1e-4  # m, and quaternion components: largest deviation of a planar motion from the plane
 _ZERO = 1e-6  # length below which a quaternion has no direction
 
@@ -56,7 +61,7 @@ DOG3D: Mapping[str, int] = {
 def read_terrainrl(
     path: str | os.PathLike[str], joints: Sequence[str], sizes: Sequence[int], root: str
 ) -> Clip:
-    """Reads a TerrainRL motion file.
+    """Reads a motion file of TerrainRL or of DeepTerrainRL.
 
     Args:
       path: JSON file.
@@ -73,11 +78,21 @@ def read_terrainrl(
       FileNotFoundError: if there is no such file.
     """
     path = pathlib.Path(path)
-    motion = _parse(path)
+    motion, head = _parse(path), _ROOT
+    if isinstance(motion.get('Motion'), dict):
+        motion, head = motion['Motion'], _PLANAR_ROOT
+        if root != 'planar':
+            raise ValueError(f'{path}: a motion in the plane; expected a planar character')
     loop = motion.get('Loop', False)
     if not isinstance(loop, bool):
         raise ValueError(f'{path}: Loop: true or false is needed, found {loop!r}')
-    return _clip(path, _frames(path, motion), joints, sizes, root, loop)
+    frames = _frames(path, motion, head)
+    if head is _PLANAR_ROOT:
+        duration, x, y, angle = frames[:, : len(head)].T
+        zero = np.zeros_like(x)
+        full = (duration, x, y, zero, np.cos(angle / 2), zero, zero, np.sin(angle / 2))
+        frames = np.column_stack([*full, frames[:, len(head) :]])
+    return _clip(path, frames, joints, sizes, root, loop)
 
 
 def read_deepmimic(
@@ -178,8 +193,13 @@ def _parse(path: pathlib.Path) -> dict[str, Any]:
     return motion
 
 
-def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
-    """Returns the frames as an array, (n, length), every number finite, no duration below `SHORTEST`."""
+def _frames(
+    path: pathlib.Path, motion: Mapping[str, Any], head: Sequence[str] = _ROOT
+) -> np.ndarray:
+    """Returns the frames as an array, (n, length), every number finite, no duration below `SHORTEST`.
+
+    `head` names the numbers before the joints.
+    """
     frames = motion.get('Frames')
     if not isinstance(frames, list):
         raise ValueError(f'{path}: Frames: an array of frames is needed')
@@ -197,10 +217,12 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
             if not (number and abs(value) < LARGEST):  # false for NaN, too
                 shown = repr(value) if len(repr(value)) < 40 else f'{repr(value)[:40]}...'
                 raise ValueError(
-                    f'{path}: frame {i}, {_field(j)}: {shown} is not a finite number below {LARGEST:g}'
+                    f'{path}: frame {i}, {_field(j, head=head)}: {shown} is not a finite number below {LARGEST:g}'
                 )
-    if len(frames[0]) < _HEADER:
-        raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
+    if len(frames[0]) < len(head):
+        raise ValueError(
+            f'{path}: frame 0 has {len(frames[0])} numbers, at least {len(head)} are needed'
+        )
     array = np.array(frames, dtype=float)
     for bad in np.flatnonzero(array[:-1, 0] < SHORTEST):
         raise ValueError(
@@ -209,10 +231,15 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
     return array
 
 
-def _field(column: int, joints: Sequence[str] = (), sizes: Sequence[int] = ()) -> str:
+def _field(
+    column: int,
+    joints: Sequence[str] = (),
+    sizes: Sequence[int] = (),
+    head: Sequence[str] = _ROOT,
+) -> str:
     """Returns the name of a column of a frame, for messages."""
-    if column < _HEADER:
-        return 'duration' if column == 0 else 'root position' if column < 4 else 'root quaternion'
+    if column < len(head):
+        return head[column]
     for joint, size in zip(joints, sizes, strict=True):
         if column < _HEADER + size:
             return f'joint {joint!r}'

@@ -13,7 +13,7 @@ from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util.files import Path, existing, read_json
 
 FORMATS = {
-    'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepMimic)',
+    'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepTerrainRL, DeepMimic)',
     'npz': 'a clip (.npz)',
 }  # fmt: skip
 HEAD = 65536  # bytes at the beginning of a file from which its format is recognised
@@ -25,9 +25,10 @@ def read(
     """Reads a motion file; its format is recognised from its content, not from its name.
 
     Args:
-      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, with the character's joints in its order, or
-        of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save` (.npz).
-      character: the character of a TerrainRL file; other formats ignore it.
+      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL or DeepTerrainRL, with the character's joints in
+        its order, or of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save`
+        (.npz).
+      character: the character of a file of the first two; other formats ignore it.
       skeleton: the .asf file that belongs to an Acclaim file; None for other formats.
       **options: of `motion.read_bvh` or `motion.read_amc`.
 

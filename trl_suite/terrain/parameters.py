@@ -11,6 +11,11 @@ defaults. Between several sets `terrain_level` interpolates, e.g. for a curricul
 `VertSpacingX` and `VertSpacingZ` are accepted and have no effect on planar ground, as in the
 original. The example printed in the paper is the preset `slopes_mixed_humanoid`.
 
+Files of DeepTerrainRL, the predecessor, have types without the prefix, such as `gaps` for
+`var2d_gaps`, and are read as such. Its vertices are 0.1 m apart and slopes change per vertex, so that
+the same numbers give ground that is rougher over short distances here. Bumps and slopes on cliffs,
+which it also had, must be 0.
+
 Three-dimensional types are keys of GENERATORS3D; their files look the same. Their height grids have
 vertices 0.2 m apart, so another `VertSpacingX` or `VertSpacingZ` is refused.
 
@@ -51,6 +56,9 @@ from trl_suite.util.errors import is_number, unknown
 from trl_suite.util.files import existing, read_json
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
+_PREFIX = 'var2d_'
+# Parameters of DeepTerrainRL's type `cliffs` that have no effect if they are 0.
+_OVERLAYS = ('BumpHMin', 'BumpHMax', 'SlopeDeltaRange', 'SlopeDeltaMin', 'SlopeDeltaMax')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,11 +159,19 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     sets = content.get('Params', ())
     if not isinstance(sets, (list, tuple)):
         raise ValueError(f'{name}: Params must be a list of parameter sets, not {sets!r}')
+    kind = content['Type']
+    if kind not in GENERATORS and f'{_PREFIX}{kind}' in GENERATORS:  # a file of DeepTerrainRL
+        kind = f'{_PREFIX}{kind}'
+        sets = [
+            {key: value for key, value in each.items() if key not in _OVERLAYS or value}
+            if kind == 'var2d_cliffs' and isinstance(each, Mapping) else each
+            for each in sets
+        ]  # fmt: skip
     unused = check(name, {key: content[key] for key in _UNUSED if key in content})
     for key in _UNUSED[1:]:
-        if content['Type'] in GENERATORS3D and unused.get(key, GRID) != GRID:
+        if kind in GENERATORS3D and unused.get(key, GRID) != GRID:
             raise ValueError(f'{name}: {key} must be {GRID:g} m, not {content[key]!r}')
-    return Terrain(name, content['Type'], tuple(sets))
+    return Terrain(name, kind, tuple(sets))
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
