@@ -113,6 +113,7 @@ setup(
             'hypothesis>=6',
             'imageio[ffmpeg]',
             'matplotlib',
+            'pycollada',
             'playwright>=1.50',  # drives Chromium, which the tests look for on the system
             'scipy',
             BVH,

@@ -9,6 +9,7 @@ import re
 import runpy
 import sys
 import tempfile
+import urllib.parse
 from unittest import mock
 
 import imageio.v3 as imageio
@@ -19,7 +20,9 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import characters, cli, engine, gym, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.characters import inspect, model_file
 from trl_suite.tasks import parts
+from trl_suite.tasks.components import description
 from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain.planar import generators
 from trl_suite.util import program
@@ -45,6 +48,8 @@ MJCF = f"""<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1"/><bod
 <actuator><position joint="right_hip" kp="90" kv="3" forcerange="-70 70"/>
 <motor joint="right_knee" gear="50" ctrlrange="-1 1"/></actuator>
 <keyframe><key qpos="0 1 0 .2 -.3 .1 -.1"/></keyframe></mujoco>"""
+LEG_BOX = trimesh.creation.box((0.1, 0.1, 0.4))
+FLAT = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
 PLANAR = {'end_effectors': ('right_shin', 'left_shin'), 'fall_links': ('trunk',)}
 TWO = {'end_effectors': ('leg',), 'fall_links': ('trunk',), 'spatial': True}
 
@@ -67,6 +72,11 @@ class Folder(parameterized.TestCase):
 def compiled(row):
     root = characters.make(row).mjcf_model
     return mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+
+
+def mesh_file(mesh, path):
+    """Writes a mesh, in the format of the file's suffix; .txt.stl is an STL file as text."""
+    mesh.export(path, file_type='stl_ascii' if path.name.endswith('.txt.stl') else None)
 
 
 def rolled(environment, actions):
@@ -176,18 +186,124 @@ class CharacterTest(Folder):
         trunk = compiled(row).body_mass[1]
         self.assertAlmostEqual(trunk, 1000 * 4 / 3 * np.pi * 0.2**3, delta=0.05 * trunk)
 
-    def test_urdf_meshes_lie_in_their_package(self):
-        (self.folder / 'urdf').mkdir()
-        (self.folder / 'meshes').mkdir()
-        trimesh.creation.box((0.1, 0.1, 0.4)).export(self.folder / 'meshes' / 'leg.stl')
-        mesh = '<mesh filename="package://robot/meshes/leg.stl"/>'
-        looks = '<visual><geometry><mesh filename="package://robot/no.dae"/></geometry></visual>'
-        text = URDF.replace('<box size=".1 .1 .4"/>', mesh).replace(
-            '<collision>', looks + '<collision>'
+    def with_mesh(self, address, mesh=None, name='two.urdf', text=URDF):
+        """Returns the compiled file whose leg has a mesh, and nothing else; it is not simulated."""
+        if mesh is not None:
+            mesh_file(mesh, self.folder / urllib.parse.unquote(address.rpartition('/')[2]))
+        head, _, leg = text.partition('<link name="leg">')
+        leg = leg.replace('<box size=".1 .1 .4"/>', f'<mesh filename="{address}"/>')
+        return model_file.compiled(
+            model_file.named(self.write(f'{head}<link name="leg">{leg}', name))
         )
-        spec = characters.from_file(self.write(text, 'urdf/two.urdf'), **TWO)
+
+    @parameterized.parameters(
+        'package://robot/meshes/leg.stl', 'package:///robot/meshes/leg.stl', 'file://{}/meshes/leg.stl',
+        'file://localhost{}/meshes/leg.stl', 'file:{}/meshes/leg.stl', 'file://{}/%6deshes/leg.stl',
+        '../meshes/leg.stl', '{}/meshes/leg.stl',
+    )  # fmt: skip
+    def test_addresses_of_meshes(self, address):
+        for folder in ('my robot/urdf', 'my robot/meshes'):
+            (self.folder / folder).mkdir(parents=True)
+        LEG_BOX.export(self.folder / 'my robot' / 'meshes' / 'leg.stl')
+        looks = '<visual><geometry><mesh filename="package://robot/no.dae"/></geometry></visual>'
+        model = self.with_mesh(
+            address.format(self.folder / 'my robot'), name='my robot/urdf/two.urdf',
+            text=URDF.replace('<collision>', f'{looks}<collision>'),
+        )  # fmt: skip
+        np.testing.assert_allclose(model.geom_size[1], [0.05, 0.05, 0.2], atol=1e-6)
+
+    def test_meshes_of_urdf_files_are_stored_in_the_spec(self):
+        LEG_BOX.export(self.folder / 'leg.stl')
+        text = URDF.replace('<box size=".1 .1 .4"/>', '<mesh filename="package://robot/leg.stl"/>')
+        spec = characters.from_file(self.write(text, 'two.urdf'), **TWO)
         self.assertLen(spec.assets, 1)
         np.testing.assert_allclose(compiled(spec).geom_size[0], [0.05, 0.05, 0.2], atol=1e-6)
+
+    @parameterized.parameters(
+        'leg.stl', 'leg.txt.stl', 'leg.TXT.stl', 'leg.obj', 'leg.ply', 'leg.dae'
+    )
+    def test_formats_of_meshes(self, name):
+        model = self.with_mesh(name, LEG_BOX)
+        np.testing.assert_allclose(model.geom_size[1], [0.05, 0.05, 0.2], atol=1e-6)
+        self.assertEqual(model.mesh_vertnum, [8])
+
+    def test_a_converted_mesh_survives(self):
+        mesh_file(LEG_BOX, self.folder / 'leg.txt.stl')
+        text = URDF.replace('<box size=".1 .1 .4"/>', '<mesh filename="leg.txt.stl"/>')
+        spec = characters.from_file(self.write(text, 'two.urdf'), **TWO)
+        (self.folder / 'leg.txt.stl').unlink()
+        model = compiled(pickle.loads(pickle.dumps(spec)))
+        np.testing.assert_allclose(model.geom_size[0], [0.05, 0.05, 0.2], atol=1e-6)
+
+    def test_the_unit_of_a_collada_file_applies(self):
+        mesh_file(LEG_BOX, self.folder / 'leg.dae')
+        text = (self.folder / 'leg.dae').read_text()
+        asset = text.index('</asset>')
+        self.write(f'{text[:asset]}<unit name="cm" meter="0.01"/>{text[asset:]}', 'leg.dae')
+        model = self.with_mesh('leg.dae')
+        np.testing.assert_allclose(model.geom_size[1], [5e-4, 5e-4, 2e-3], atol=1e-7)
+
+    def test_without_a_reader_of_collada_the_remedy_is_named(self):
+        self.write('<COLLADA/>', 'leg.dae')
+        with (
+            mock.patch.object(trimesh, 'available_formats', return_value={'stl'}),
+            self.assertRaisesRegex(
+                ValueError, "mesh 'leg' of 'leg': .*leg.dae: pycollada is .*; pip"
+            ),
+        ):
+            self.with_mesh('leg.dae')
+
+    @parameterized.parameters(
+        ('file://host/leg.stl', 'is not the address of a file on this machine; expected an abs'),
+        ('file://$(find robot)/leg.stl', 'is not the address of a file on this machine'),
+        ('file:./leg.stl', 'is not the address of a file on this machine'),
+        ('https://host/leg.stl', "cannot be read; expected a path, or an address that begins"),
+        ('model://robot/leg.stl', 'cannot be read; expected a path'),
+        ('package://robot/leg.stl', "there is no 'leg.stl', from the address 'package://robot/leg"),
+        ('file:///no/leg.stl', "there is no file '/no/leg.stl'"),
+        ('leg.stl', "there is no file 'leg.stl'"),
+        ('leg.dae', 'leg.dae: cannot be read as a mesh', 'no mesh'),
+        ('leg.stl', 'leg.stl: ', 'solid leg, but no mesh'),
+        ('leg.stl', 'all corners are in a plane; expected a solid', FLAT),
+        ('leg.stl', 'it is too small; is its scale right', LEG_BOX.copy().apply_scale(1e-8)),
+    )  # fmt: skip
+    def test_meshes_that_are_refused(self, address, message, mesh=None):
+        """The message names the mesh, its link and the remedy."""
+        if isinstance(mesh, str):
+            self.write(mesh, address)
+            mesh = None
+        with self.assertRaisesRegex(ValueError, f"mesh 'leg' of 'leg': .*{re.escape(message)}"):
+            self.with_mesh(address, mesh)
+
+    def test_a_mesh_without_volume(self):
+        """It is refused only where the mass of a link would have to be derived from it."""
+        mesh = LEG_BOX.copy().apply_scale(1e-5)
+        model = self.with_mesh('leg.stl', mesh)
+        np.testing.assert_allclose(model.geom_size[1], [5e-7, 5e-7, 2e-6], rtol=1e-3)
+        inertial = URDF[URDF.rindex('<inertial>') : URDF.rindex('</inertial>') + len('</inertial>')]
+        head, _, tail = URDF.rpartition(inertial)
+        with self.assertRaisesRegex(ValueError, 'it encloses no volume, from which to derive'):
+            self.with_mesh('leg.stl', text=head + tail)
+
+    @parameterized.parameters(
+        ('ixx=".01"', 'ixx=".1"', 'larger than the sum of the others.*pass balance_inertia=True'),
+        ('ixx=".01"', 'ixx="-.1"', 'expected positive ones'),
+        ('value="2"', 'value="0"', 'it moves, and has no mass or no inertia; expected both'),
+    )  # fmt: skip
+    def test_inertia_that_is_refused(self, before, after, message):
+        head, _, leg = URDF.partition('<link name="leg">')
+        text = f'{head}<link name="leg">{leg.replace(before, after)}'
+        with self.assertRaisesRegex(ValueError, f"two.urdf: link 'leg': .*{message}"):
+            characters.from_file(self.write(text, 'two.urdf'), **TWO)
+
+    @parameterized.parameters(('ixx=".01"', 'ixx=".1"', 0.04), ('ixy="0"', 'ixy=".01"', 0.01))
+    def test_inertia_is_balanced_on_request(self, before, after, expected):
+        spec = model_file.named(self.write(URDF.replace(before, after), 'two.urdf'))
+        model_file.balance_inertia(spec)
+        np.testing.assert_allclose(model_file.compiled(spec).body_inertia[1:], expected)
+        path = self.folder / 'two.urdf'
+        made = characters.from_file(path, **TWO, balance_inertia=True)
+        np.testing.assert_allclose(compiled(made).body_inertia[1:], expected)
 
     @parameterized.parameters('position', 'torque', 'velocity')
     def test_it_starts_on_the_ground(self, actuation):
@@ -245,12 +361,13 @@ class CharacterTest(Folder):
         ('inner_root', {'root': 'left_shin'}, "is the child of another body; did you mean 'trunk'"),
         ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
         ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
-        ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
-        ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
+        ('none', {'end_effectors': ()}, 'expected a sequence of one name or more'),
+        ('text', {'fall_links': 'trunk'}, 'expected a sequence of names'),
+        ('balance', {'balance_inertia': 1}, 'balance_inertia is 1; expected True or False'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
         ('name', {'name': 'dog'}, "has a character named 'dog'"),
         ('slash', {'name': 'a/b'}, "name is 'a/b'; expected a name without '/'"),
-        ('number', {'fall_links': 3}, 'fall links are 3; expected a sequence of one name or more'),
+        ('number', {'fall_links': 3}, 'fall links are 3; expected a sequence of names'),
         ('effectors', {'end_effectors': 3}, 'end effectors are 3; expected a sequence'),
         ('exempt', {'stumble_exempt': 3}, 'stumble-exempt links are 3; expected a sequence'),
         ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
@@ -357,16 +474,17 @@ class CharacterTest(Folder):
         ('no_root_joints', 'name="x" type="slide"', 'name="x"', 'has hinge, hinge, slide; expected'),
         ('out_of_plane', 'name="left_knee" axis="0 -1 0"', 'name="left_knee" axis="1 0 0"', "hinge 'left_knee' .* leaves"),
         ('free_slide', 'name="left_knee" axis="0 -1 0" range="-120 0"', 'name="left_knee" type="slide" axis="0 0 1"', "slide 'left_knee' has no limits"),
-        ('mass', '<geom type="capsule"', '<geom mass="0" type="capsule"', 'mass and inertia of moving bodies'),
+        ('mass', '<geom type="capsule"', '<geom mass="0" type="capsule"', 'it moves, and has no mass or no inertia'),
         ('turned', 'name="trunk" pos="0 0 1"', 'name="trunk" euler="0 0 90"', 'leaves the x-z plane'),
-        ('two_roots', '</worldbody>', '<body name="ball"><freejoint/><geom size="1"/></body></worldbody>', 'several bodies may be the root'),
+        ('two_roots', '</worldbody>', '<body name="ball"><freejoint/><geom size="1"/><body name="hat"><joint/><geom size="1"/></body></body></worldbody>', r"several bodies may be the root; pass root=, one of .'trunk', 'ball'."),
         ('broken', '</mujoco>', '', 'not a model'),
         ('nan', 'name="left_knee" axis', 'name="left_knee" armature="nan" axis', 'armature="nan" of .left_knee. .<joint>.; expected finite'),
         ('infinity', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="0 0 inf"', 'line 1: pos="0 0 inf" of .trunk.'),
         ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
+        ('no_size', 'size=".15 .15 .2"', 'size=".15 0 .2"', "geom 'trunk_geom0': a size is 0; expected positive sizes"),
         ('copies', '<geom type="capsule"', '<replicate count="60"><replicate count="60"><geom size="1"/></replicate></replicate><geom type="capsule"', 'bodies, joints, geoms and sites are 144[0-9][0-9]; expected no more than 10000'),
         ('many', '<geom type="capsule"', 2501 * '<geom size="1"/>' + '<geom type="capsule"', 'geoms and sites are 100[0-9][0-9]; expected no more'),
-        ('flex', '<geom size=".15', '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" name="cloth" rigid="true"/><geom size=".15', "unknown body 'trunk' in flex"),
+        ('flex', '<geom size=".15', '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" name="cloth" rigid="true"/><geom size=".15', "flex 'cloth': flexible bodies are not supported, .*; remove it, or replace it by geoms"),
         ('unstable', 'name="left_knee" axis', 'name="left_knee" springref="1e15" stiffness="1e15" axis', 'diverges in the first step'),
         ('far', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="1e300 0 1"', 'line 1: pos="1e300 0 1" of .trunk.* up to 1e.30'),
         ('line_break', 'name="right_shin"', 'name="right&#10;shin"', r"'right.nshin' has a slash, a line break"),
@@ -389,12 +507,95 @@ class CharacterTest(Folder):
         with self.assertRaisesRegex(ValueError, "figure.xml: .*'part.xml' already included"):
             self.planar(text, root='trunk')
 
+    def test_bodies_beside_the_character(self):
+        """Targets, balls and furniture are no roots, and what ties the character to them is left out."""
+        beside = (
+            '<body name="target" mocap="true"><geom size=".1"/></body><body name="table"><geom size=".1"/></body>'
+            '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody><equality>'
+            '<weld name="drag" body1="target" body2="trunk"/><connect name="nail" body1="trunk" anchor="0 0 0"/>'
+            '<weld name="fix" body1="world" body2="trunk"/><joint name="slip" joint1="x" joint2="left_hip"/>'
+            '<weld name="tie" body1="right_shin" body2="left_shin"/></equality>'
+        )
+        rope = (
+            '<tendon><spatial name="rope"><site site="anchor"/><site site="hook"/></spatial>'
+            '<fixed name="both"><joint joint="left_hip" coef="1"/></fixed></tendon></mujoco>'
+        )
+        text = MJCF.replace('</worldbody>', beside).replace('</mujoco>', rope)
+        text = text.replace('<geom size=".15', '<site name="hook"/><geom size=".15')
+        spec = self.planar(text.replace('<worldbody>', '<worldbody><site name="anchor"/>'))
+        self.assertEqual(spec.links[0], 'trunk')
+        ties = ("spatial 'rope'", "weld 'drag'", "connect 'nail'", "weld 'fix'", "joint 'slip'")
+        self.assertEqual([note for note in spec.notes if 'ties' in note], [
+            f'{tie} is left out: it ties the character to something else' for tie in ties
+        ])  # fmt: skip
+        self.assertEqual(compiled(spec).ntendon, 1)
+        self.assertEqual(compiled(spec).neq, 1)
+
+    @parameterized.parameters(True, False)
+    def test_without_fall_links_no_fall_ends_an_episode(self, spatial):
+        spec = self.planar(spatial=spatial, fall_links=())
+        self.assertEqual(spec.fall_links, ())
+        environment = suite.build(spec, task='walk', task_kwargs={'random': 0})
+        environment.reset()
+        root = environment.physics.bind(environment.task.character.root_body)
+        for _ in range(90):
+            self.assertFalse(environment.step(np.zeros(4)).last())
+        self.assertLess(root.xpos[2], 0.5)  # it lies on the ground
+        text = repr(description.fall(environment.task))
+        self.assertIn('the physics diverges', text)
+        self.assertNotIn('a fall: ', text)
+
+    def test_the_stops_of_joints_keep_their_stiffness(self):
+        """A joint without `solreflimit`, or with MuJoCo's default, has the suite's."""
+        text = MJCF.replace('name="left_hip"', 'name="left_hip" solreflimit="0.05 0.8"')
+        text = text.replace('name="left_knee"', 'name="left_knee" solreflimit="-900 -30"')
+        text = text.replace('name="right_hip"', 'name="right_hip" solreflimit="0.02 1"')
+        environment = suite.build(self.planar(text), task='walk')
+        model = environment.physics.model
+        stops = {n: model.jnt_solref[model.name2id(f'figure/{n}', 'joint')].tolist() for n in (
+            'left_hip', 'left_knee', 'right_hip', 'right_knee')}  # fmt: skip
+        stiff = [2 * model.opt.timestep, 1]
+        self.assertEqual(
+            stops, {'left_hip': [0.05, 0.8], 'left_knee': [-900, -30], 'right_hip': stiff, 'right_knee': stiff}
+        )  # fmt: skip
+
+    @parameterized.parameters(
+        ('FL_hip', 'FR_hip'), ('RL_foot', 'RR_foot'), ('fl', 'fr'), ('hl.knee', 'hr.knee'), ('LF_HIP', 'RF_HIP'),
+        ('LH_FOOT', 'RH_FOOT'), ('lf_leg', 'rf_leg'), ('foot_FL', 'foot_FR'), ('leg_bl', 'leg_br'), ('MLHip', 'MRHip'),
+        ('left_hip', 'right_hip'), ('hipL', 'hipR'), ('L_toe', 'R_toe'), ('calf_l', 'calf_r'),
+    )  # fmt: skip
+    def test_left_and_right_are_found_in_names(self, left, right):
+        places = {left: np.array([0, 1.0, 0]), right: np.array([0, -1.0, 0])}
+        for turned, expected in ((places, [1, 0]), ({k: -v for k, v in places.items()}, [-1, 0])):
+            np.testing.assert_array_equal(inspect.facing(turned), expected)
+
+    @parameterized.parameters('flap', 'Floor', 'wheel', 'rl', 'plate')
+    def test_a_name_without_a_side(self, name):
+        places = {name: np.array([0, 1.0, 0]), 'frap': np.zeros(3), 'Froor': np.zeros(3)}
+        self.assertIsNone(inspect.facing(places))
+
     def test_limbs_are_found(self):
         spec = characters.from_file(self.write(MJCF))
         self.assertEqual(
             (spec.end_effectors, spec.fall_links, spec.stumble_exempt),
             (PLANAR['end_effectors'], PLANAR['fall_links'], PLANAR['end_effectors']),
         )
+
+    def test_if_only_feet_can_touch_the_ground_there_are_no_fall_links(self):
+        text = re.sub('<geom (?!name="floor"|type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body>)',
+                      '<geom contype="0" conaffinity="0" ', MJCF)  # fmt: skip
+        spec = characters.from_file(self.write(text))
+        self.assertEqual((spec.end_effectors, spec.fall_links), (PLANAR['end_effectors'], ()))
+        self.assertIn('no fall links: no body above', '; '.join(spec.notes))
+
+    def test_a_declared_version_of_xml_is_ignored(self):
+        for declaration in (
+            '<?xml version="0.0" ?>',
+            "<?xml version='1.1'?>",
+            '<?xml version="1.0" encoding="iso-8859-1"?>',
+        ):
+            text = declaration + MJCF
+            self.assertEqual(self.planar(text).links[0], 'trunk')
 
     def test_a_body_may_be_named_nan(self):
         self.assertIn(

@@ -45,13 +45,17 @@ EXCITATION_OFFSET, EXCITATION_SCALE = 0.505, 0.495  # [0.01, 1]
 def _prepare(
     character: Character, timestep: float, damping: np.ndarray, least: np.ndarray | None = None
 ) -> None:
-    """Sets every joint's armature, at least `least` (J,), its damping (J,) and a stiff limit."""
+    """Sets every joint's armature, at least `least` (J,), its damping (J,) and a stiff limit.
+
+    A joint keeps the `solreflimit` of its MJCF.
+    """
     armature = np.array([joint.armature for joint in character.spec.joints.values()])
     armature = armature if least is None else np.maximum(armature, least)
     for joint, inertia, value in zip(character.joints, armature, damping, strict=True):
         joint.armature = inertia
         joint.damping = value
-        joint.solreflimit = (2 * timestep, 1)
+        if joint.solreflimit is None:
+            joint.solreflimit = (2 * timestep, 1)
 
 
 def _spread(character: Character, per_joint: np.ndarray) -> np.ndarray:

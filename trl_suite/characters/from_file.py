@@ -17,8 +17,10 @@ torque limits of the file are kept; missing values are chosen as follows:
 
 `spec.notes` lists these assumptions, and the actuators that were left out: those that act on a
 tendon, a site or a body, because every joint gets its own actuator. The passive damping of joints
-is added to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept;
-sensors, lights and everything outside the character are removed.
+is added to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept, and the
+`solreflimit` of joint limits, if it is not MuJoCo's default: it describes the robot's stops, and MuJoCo
+keeps a time constant stable at any time step. Limits without it are as stiff as the time step permits.
+Sensors, lights, everything outside the character, and tendons and equalities with it are removed.
 """
 
 from __future__ import annotations
@@ -32,11 +34,13 @@ import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 
+from trl_suite.characters import model_file
 from trl_suite.characters.character import Character, CharacterSpec, Joint
 from trl_suite.characters.inspect import KINDS, ModelInspector
 from trl_suite.characters.model_file import (
     Rotation,
     check_numbers,
+    compiled,
     find_root,
     flat,
     named,
@@ -52,6 +56,7 @@ _DIVERGED = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]  # fmt: skip
+SOFT = (0.02, 1.0)  # MuJoCo's default for joint limits: not the choice of the file's author
 CAMERA_AWAY = 3.2  # distance of cameras, in reaches of the character
 
 _CAMERAS = {  # position in units of the distance, and the axes of the picture
@@ -72,6 +77,7 @@ def from_file(
     turn: Sequence[float] | None = None,
     joints: Mapping[str, Joint] | None = None,
     stumble_exempt: Sequence[str] | None = None,
+    balance_inertia: bool = False,
     name: str | None = None,
     description: str = "A user's own character.",
 ) -> CharacterSpec:
@@ -80,14 +86,16 @@ def from_file(
     Links are all bodies with mass, in the order of the file; joints keep their names.
 
     Args:
-      path: MJCF (.xml, .mjcf) or .urdf; meshes are read from the paths in the file, and package://
-        addresses from the folders that contain the file. Visual geoms of a URDF file are discarded,
-        as by MuJoCo.
+      path: MJCF (.xml, .mjcf) or .urdf; meshes are read from the paths in the file, from file://
+        addresses, and package:// addresses from the folders that contain the file. Visual geoms of a
+        URDF file are discarded, as by MuJoCo. Meshes may be .stl, .obj, .ply, and with pycollada
+        .dae, whose unit is applied and whose up axis is not.
       end_effectors: bodies whose positions imitation tracks and whose contacts are observed, e.g.
         feet; by default the last bodies of limbs that reach below the centre of mass.
-      fall_links: bodies whose contact with the ground ends the episode; by default the first one
-        with geoms that can touch it, and with limbs.
-      root: body that is the ancestor of all others, a child of the world; by default the only one.
+      fall_links: bodies whose contact with the ground ends the episode, () for none; by default the
+        first one with geoms that can touch it, and with limbs, if there is one.
+      root: body that is the ancestor of all others, a child of the world; by default the only one
+        with joints below it.
       spatial: whether the character moves in three dimensions, instead of in the x-z plane; by
         default derived from the root's joints: a free joint, or two slides and a hinge.
       turn: rotation, as a quaternion wxyz, that makes the character face +x with z up; by default
@@ -95,6 +103,8 @@ def from_file(
       joints: parameters of joints by name, which replace those derived from the file.
       stumble_exempt: bodies that may touch the ground without a stumble; by default the end
         effectors.
+      balance_inertia: whether to replace moments of inertia that no body has by their mean: one is
+        larger than the sum of the others, or not positive; by default they are an error.
       name: name of the character; by default the file's.
       description: one line.
 
@@ -106,15 +116,16 @@ def from_file(
     """
     for option, value, kind in (
         ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
-        ('description', description, str),
+        ('description', description, str), ('balance_inertia', balance_inertia, bool),
     ):  # fmt: skip
         errors.check_kind(option, value, kind)
-    for what, names in (
-        ('end effectors', end_effectors), ('fall links', fall_links),
-        ('stumble-exempt links', stumble_exempt),
+    for what, names, least in (
+        ('end effectors', end_effectors, 1), ('fall links', fall_links, 0),
+        ('stumble-exempt links', stumble_exempt, 0),
     ):  # fmt: skip
-        if names is not None and not _is_names(names):
-            raise ValueError(f'{what} are {names!r}; expected a sequence of one name or more')
+        if names is not None and not _is_names(names, least):
+            expected = 'one name or more' if least else 'names'
+            raise ValueError(f'{what} are {names!r}; expected a sequence of {expected}')
     if name == '':
         raise ValueError("name is ''; expected a name, or None for that of the file")
     if joints is not None and not isinstance(joints, Mapping):
@@ -129,7 +140,7 @@ def from_file(
     file.open('rb').close()  # raises an OSError if it cannot be read
     try:
         spec = limited.call(
-            _read, os.path.abspath(file), name, description, root, spatial, rotation,
+            _read, os.path.abspath(file), name, description, root, spatial, rotation, balance_inertia,
             *(
                 None if names is None else tuple(names)
                 for names in (end_effectors, fall_links, stumble_exempt)
@@ -146,12 +157,12 @@ def from_file(
     return dataclasses.replace(spec, joints={**spec.joints, **(joints or {})})
 
 
-def _is_names(names: object) -> bool:
-    """Whether an argument is a collection of one name or more."""
+def _is_names(names: object, least: int) -> bool:
+    """Whether an argument is a collection of at least so many names."""
     return (
         isinstance(names, Collection)
         and not isinstance(names, (str, bytes))
-        and len(names) > 0
+        and len(names) >= least
         and all(isinstance(name, str) for name in names)
     )
 
@@ -163,6 +174,7 @@ def _read(
     root: str | None,
     spatial: bool | None,
     rotation: np.ndarray | None,
+    balance: bool,
     end_effectors: tuple[str, ...] | None,
     fall_links: tuple[str, ...] | None,
     exempt: tuple[str, ...] | None,
@@ -171,7 +183,9 @@ def _read(
     file = pathlib.Path(path)
     check_numbers(file)
     spec = named(file)
-    model = spec.compile()
+    if balance:
+        model_file.balance_inertia(spec)
+    model = compiled(spec)
     number = find_root(model, root)
     own_turn = model.body_quat[number]
     is_turned = abs(own_turn[0]) < 1 - 1e-6
@@ -185,8 +199,11 @@ def _read(
             'the world'
         )
     lowest, first = found.limbs()
-    end_effectors, fall_links = end_effectors or lowest, fall_links or first
-    exempt = exempt or end_effectors
+    end_effectors = end_effectors or lowest
+    if fall_links is None and not first:
+        found.notes.append('no fall links: no body above the ends of limbs can touch the ground')
+    fall_links = first if fall_links is None else fall_links
+    exempt = end_effectors if exempt is None else exempt
     found.check_names('end effector', end_effectors)
     found.check_posture(end_effectors)
     found.check_names('fall link', fall_links, solid=True)
@@ -222,7 +239,10 @@ def _check_physics(spec: CharacterSpec) -> None:
     """Raises an error if a character in an arena cannot be compiled or simulated."""
     character, arena = Character(spec), composer.Arena()
     character.create_root_joints(arena.attach(character))
-    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    try:
+        physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    except ValueError as error:  # it begins with a hint to debug dm_control
+        raise ValueError(str(error).partition('information.')[2] or str(error)) from None
     model, data = physics.model.ptr, physics.data.ptr
     mujoco.mj_step(model, data)
     for name in dir(model):
@@ -259,11 +279,16 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         for item in tree.contact.all_children()
         if item.tag == 'pair' or not {item.body1.name, item.body2.name} <= {*found.bodies}
     ]
+    ties = _ties(tree, root, joints)
+    found.notes += [
+        f'{item.tag} {item.name!r} is left out: it ties the character to something else'
+        for item in ties
+    ]
     lists = [*tree.actuator.all_children(), *tree.sensor.all_children()]
     lists += [*tree.keyframe.all_children(), *excluded]
     grounds = [item for item in tree.asset.texture if item.type == 'skybox']
     grounds += tree.asset.hfield
-    for element in (*lists, *joints, *outside, *grounds):
+    for element in (*lists, *ties, *joints, *outside, *grounds):
         element.remove()
     for element in (tree.option, tree.size, tree.visual, tree.statistic):
         element.remove()
@@ -290,6 +315,8 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         joint.pos = model.jnt_pos[i]
         joint.axis = model.jnt_axis[i]
         joint.range = model.jnt_range[i] if limited else None
+        stiffness = model.jnt_solref[i]
+        joint.solreflimit = None if (stiffness == SOFT).all() else stiffness
         joint.actuatorfrclimited = True
         joint.actuatorfrcrange = (-found.limits[name], found.limits[name])
     for i in found.geoms:
@@ -302,6 +329,27 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
             geom.rgba = COLOUR  # visual geoms, which have colours, were discarded
     _stage(tree, root, found.reach(found.data.xpos[found.root], found.root))
     return tree
+
+
+def _ties(
+    tree: mjcf.RootElement, root: mjcf.Element, joints: list[mjcf.Element]
+) -> list[mjcf.Element]:
+    """Returns tendons and equalities with the world, the root's joints, or bodies beside the root."""
+    kinds = ('body', 'geom', 'site', 'joint')
+    own = [root, *(each for kind in kinds for each in root.find_all(kind) if each not in joints)]
+    known, ties = {(each.tag, each.name) for each in own}, []
+    for item in (*tree.tendon.all_children(), *tree.equality.all_children()):
+        ends = [
+            (end.tag, end.name)
+            for part in (item, *item.all_children())
+            for end in part.get_attributes().values()
+            if isinstance(end, mjcf.Element) and end.tag not in ('default', 'material')
+        ]
+        if not known.issuperset(ends) or (item.tag in ('connect', 'weld') and len(ends) < 2):
+            ties.append(item)
+        else:
+            known.add((item.tag, item.name))  # an equality may refer to a tendon
+    return ties
 
 
 def _stage(tree: mjcf.RootElement, root: mjcf.Element, reach: float) -> None:

@@ -39,6 +39,8 @@ _FREE, _BALL, _SLIDE, _HINGE = (
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SIDES = (
     ('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'), ('l$', 'r'), ('L$', 'R'),
+    # Front, rear, hind, back and middle legs, such as FL_hip and RL_hip.
+    ('(^|[^A-Za-z])([frhbm])l(?![a-z])', r'\1\2r'), ('(^|[^A-Za-z])([FRHBM])L(?![a-z])', r'\1\2R'),
 )  # fmt: skip
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
 
@@ -198,8 +200,8 @@ class ModelInspector:
     def limbs(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Returns the last bodies of limbs that reach below the centre of mass, and the first inner one.
 
-        Only bodies that can touch the ground count. If no limb reaches down, all do; if no body is an
-        inner one, the first of the last ones is returned.
+        Only bodies that can touch the ground count. If no limb reaches down, all do. If no body is an
+        inner one, e.g. because only feet can touch the ground, the second tuple is empty.
         """
         model, data = self.model, self.data
         mujoco.mj_comPos(model, data)
@@ -210,8 +212,9 @@ class ModelInspector:
                 inner.add(body)
         last = [i for i in solid if i not in inner]
         low = [i for i in last if data.xipos[i, 2] < data.subtree_com[self.root, 2]] or last
-        falls = [i for i in solid if i in inner] or last
-        return tuple(model.body(i).name for i in low), (model.body(falls[0]).name,)
+        falls = [i for i in solid if i in inner][:1]
+        low_names, fall_names = (tuple(model.body(i).name for i in each) for each in (low, falls))
+        return low_names, fall_names
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
         model = self.model

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from lxml import etree
 
+from trl_suite.characters import meshes
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
@@ -21,9 +22,25 @@ MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
 # Kinds of elements, besides bodies, that need names because they are looked up later.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
+# Part of an error of the engine -> what it means, and the remedy.
+_REMEDIES = {
+    'A + B >= C': 'one moment of inertia is larger than the sum of the others, as of no body; correct '
+    'it, or pass balance_inertia=True, which replaces all three by their mean',
+    'positive eigenvalues': 'its moments of inertia are not those of a body; expected positive ones; '
+    'or pass balance_inertia=True, which replaces all three by their mean, if that is positive',
+    'mass and inertia of moving bodies': 'it moves, and has no mass or no inertia; expected both in '
+    'its inertial, or a fixed joint',
+    'coplanar vertices': 'all corners are in a plane; expected a solid, such as a thin box',
+    'at least 4 vertices': 'it has less than 4 corners; expected a solid, such as a thin box',
+    'mesh volume is too small': 'it encloses no volume, from which to derive a mass; expected an '
+    'inertial with the mass, or a closed mesh',
+    'must be positive in geom': 'a size is 0; expected positive sizes',
+    'surface area is too small': 'it is too small; is its scale right? expected lengths in m',
+}
+
 
 def named(file: pathlib.Path) -> mujoco.MjSpec:
-    """Reads a file, and gives names to elements without a name."""
+    """Reads a file and its meshes, and gives names to elements without a name."""
     spec = mujoco.MjSpec.from_file(str(file))
     parts = sum(len(getattr(spec, kind)) for kind in ('bodies', 'joints', 'geoms', 'sites'))
     if parts > MOST_PARTS:
@@ -32,8 +49,6 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
         )
     spec.memory = spec.njmax = spec.nconmax = spec.nstack = -1  # it is simulated in another model
     spec.compiler.fusestatic = False  # bodies without joints may be end effectors
-    for mesh in spec.meshes:
-        mesh.file = _in_package(file, mesh.file)
     taken = {kind: {item.name for item in getattr(spec, kind)} for kind in ('bodies', *_NAMED)}
     for number, body in enumerate(spec.bodies[1:], 1):
         by_joint = body.joints[0].name if body.joints else ''
@@ -51,7 +66,52 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
                 f'the name {item.name!r} has a slash, a line break or another character that is '
                 'not printable; expected a name without them'
             )
+    for flex in spec.flexes:
+        raise ValueError(
+            f'flex {flex.name!r}: flexible bodies are not supported, nor rigid ones made of a flex; '
+            'remove it, or replace it by geoms'
+        )
+    meshes.prepare(spec, file)
     return spec
+
+
+def balance_inertia(spec: mujoco.MjSpec) -> None:
+    """Replaces moments of inertia that no body has by their mean."""
+    spec.compiler.balanceinertia = (
+        True  # of those one of which is larger than the sum of the others
+    )
+    for body in spec.bodies:
+        xx, yy, zz, xy, xz, yz = body.fullinertia
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if np.isfinite(tensor).all() and np.linalg.eigvalsh(tensor)[0] <= 0 < tensor.trace():
+            body.fullinertia = (*3 * (tensor.trace() / 3,), 0, 0, 0)
+
+
+def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a file; a mesh without volume is no fault if the mass of its bodies is given.
+
+    Raises:
+      ValueError: the engine refuses it; the message is the engine's, or where there is a remedy, one
+        that names the link and the remedy.
+    """
+    # After an error, they cannot be asked for.
+    users, shapes = meshes.users(spec), {mesh.name: mesh for mesh in spec.meshes}
+    for _ in range(len(shapes) + 1):
+        try:
+            return spec.compile()
+        except ValueError as error:
+            text = str(error)
+        name = (re.findall("Element name '(.*)', id", text) or [''])[0]
+        if 'mesh volume is too small' not in text or not all(users.get(name, {}).values()):
+            break
+        shapes[name].inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    of_mesh = name in users and re.search('mesh|vertices', text)
+    kind = 'geom' if 'in geom' in text else 'link'
+    what = meshes.described(name, users[name]) if of_mesh else f'{kind} {name!r}'
+    for part, remedy in _REMEDIES.items():
+        if part in text:
+            text = f'{what}: {remedy}'
+    raise ValueError(text)
 
 
 def _name(item: Any, wanted: str, taken: set[str]) -> None:
@@ -77,7 +137,11 @@ def check_numbers(file: pathlib.Path) -> None:
         where = '' if each == file else f'{each}: '
         try:
             parser = etree.XMLParser(resolve_entities=False)
-            elements = [*etree.fromstring(each.read_bytes(), parser).iter(etree.Element)]
+            # MuJoCo ignores the version of XML, of which lxml knows one.
+            content = re.sub(
+                rb'\A(\s*<\?xml\s+version=).*?(?=[\s?])', rb'\1"1.0"', each.read_bytes()
+            )
+            elements = [*etree.fromstring(content, parser).iter(etree.Element)]
         except etree.XMLSyntaxError as error:
             raise ValueError(f'{where}not a model: {error}') from None
         names = {element.get(key) for element in elements for key in ('name', 'class')}
@@ -106,31 +170,21 @@ def _is_huge(text: str) -> bool:
         return False
 
 
-def _in_package(file: pathlib.Path, name: str) -> str:
-    """Returns the path of a mesh of a ROS package, from a file in that package."""
-    address = re.fullmatch(r'package:/+([^/]+)/(.+)', name)
-    if address is None:
-        return name
-    package, inside = address.groups()
-    places = [
-        parent / part
-        for parent in file.resolve().parents
-        for part in (inside, f'{package}/{inside}')
-    ]
-    return str(next((place for place in places if place.is_file()), name))
-
-
 def find_root(model: mujoco.MjModel, root: str | None) -> int:
-    """Returns the id of the root body; by default the only child of the world."""
+    """Returns the id of the root body; by default the only child of the world with joints below."""
     top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
-    if root is None and len(top) == 1:
-        (root,) = top
+    jointed = {model.body_rootid[i] for i in model.jnt_bodyid if model.body_parentid[i]}
+    likely = [name for name, i in top.items() if i in jointed and model.body_mocapid[i] < 0] or [
+        *top
+    ]
+    if root is None and len(likely) == 1:
+        (root,) = likely
     if root in top:
         return top[root]
     if not top:
         raise ValueError('there is no body; expected one that is the ancestor of all others')
     if root is None:
-        raise ValueError(f'several bodies may be the root; pass root=, one of {[*top]}')
+        raise ValueError(f'several bodies may be the root; pass root=, one of {likely}')
     names = [model.body(i).name for i in range(1, model.nbody)]
     if root in names:
         above = model.body(model.body_rootid[model.body(root).id]).name
@@ -166,7 +220,7 @@ def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjMod
         if each is not frame and each.frame is None:
             each.set_frame(frame)
     if body.explicitinertial:
-        model = spec.compile()  # resolves orientations that are not given as quaternions
+        model = compiled(spec)  # resolves orientations that are not given as quaternions
         number = model.body(root).id
         turn = Rotation(rotation)
         body.ipos = turn.vector(model.body_ipos[number])
@@ -175,7 +229,7 @@ def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjMod
         body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.quat = 1, 0, 0, 0
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    return spec.compile()
+    return compiled(spec)
 
 
 def flat(text: str) -> str:

@@ -160,11 +160,10 @@ def clip(task: Any) -> Section:
 
 def fall(task: Any, missed: str = '') -> Section:
     """Returns the conditions of failure; `missed` is a further condition."""
-    return section(
-        'Termination (discount 0)',
-        f'a fall: one of {", ".join(task.character.spec.fall_links)} touches the ground at the end of a step; '
-        f'{missed}or the physics diverges',
-    )
+    links = ', '.join(task.character.spec.fall_links)
+    fell = f'a fall: one of {links} touches the ground at the end of a step; ' if links else ''
+    either = 'or ' if fell or missed else ''
+    return section('Termination (discount 0)', f'{fell}{missed}{either}the physics diverges')
 
 
 def missed(task: Any) -> str:
