@@ -50,9 +50,38 @@ class TryTest(CommandTest):
         self.assertIn('note: actuators that are left out, 1 of 3, because', out)
         self.assertTrue(pathlib.Path('a.png').exists())
 
+    def test_a_character_without_fall_links(self):
+        pathlib.Path('figure.xml').write_text(own_test.MJCF)
+        out = self.output('try', 'figure.xml', '--spatial', '--fall-links')
+        self.assertIn('must not touch the ground: none', out)
+        self.assertIn('note: --spatial was given and is used', out)
+
+    def test_a_character_that_diverges(self):
+        """The report and the picture are written all the same."""
+        spring = 'name="left_knee" stiffness="1e6" springref="90" axis'
+        pathlib.Path('figure.xml').write_text(
+            own_test.MJCF.replace('name="left_knee" axis', spring)
+        )
+        status, out, err = run('try', 'figure.xml')
+        self.assertEqual(status, 2)
+        self.assertRegex(out, '(?s)flat: diverges after 0.0.* s of zero actions\n.*try_figure.png')
+        self.assertRegex(
+            err, r'figure.xml: its simulation diverges on flat, slopes, steps; expected a'
+        )
+        self.assertTrue(pathlib.Path('try_figure.png').exists())
+
+    def test_messages_name_the_options_of_the_command(self):
+        text = own_test.URDF.replace('ixx=".01"', 'ixx=".1"')
+        pathlib.Path('two.urdf').write_text(text)
+        self.assert_refused('or pass --balance-inertia, which', 'try', 'two.urdf', '--spatial')
+        hat = '<body name="hat"><freejoint/><geom size="1"/><body><joint/><geom size="1"/></body></body>'
+        text = own_test.MJCF.replace('</worldbody>', f'{hat}</worldbody>')
+        pathlib.Path('figure.xml').write_text(text)
+        self.assert_refused("pass --root, one of .'trunk', 'hat'", 'try', 'figure.xml')
+
     def test_invalid_files_are_rejected(self):
         pathlib.Path('two.urdf').write_text(own_test.URDF)
-        self.assert_refused('spatial=True or spatial=False', 'try', 'two.urdf')
+        self.assert_refused('pass --spatial or --no-spatial', 'try', 'two.urdf')
         self.assert_refused("no such file; did you mean 'two.urdf'", 'try', 'tow.urdf')
         self.assert_refused(
             "unknown root 'leg2'; did you mean 'leg'", 'try', 'two.urdf', '--root', 'leg2'

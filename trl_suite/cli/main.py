@@ -255,8 +255,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         '--end-effectors', nargs='+', metavar='BODY', help='by default the last body of each limb'
     )
     command.add_argument(
-        '--fall-links', nargs='+', metavar='BODY',
-        help='links that must not touch the ground; by default the first that can touch it',
+        '--fall-links', nargs='*', metavar='BODY',
+        help='links that must not touch the ground; without names there are none; by default the '
+        'first that can touch it',
     )  # fmt: skip
     command.add_argument(
         '--spatial', action=argparse.BooleanOptionalAction,
@@ -265,6 +266,10 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         '--turn', nargs=4, type=float, metavar=('W', 'X', 'Y', 'Z'),
         help='quaternion that rotates the character so that it faces +x, with z up',
+    )  # fmt: skip
+    command.add_argument(
+        '--balance-inertia', action='store_true',
+        help='replace moments of inertia that no body has by their mean',
     )  # fmt: skip
     command.add_argument(
         '--output',

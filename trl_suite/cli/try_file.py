@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,31 +19,56 @@ if TYPE_CHECKING:
 
 TERRAINS = {True: ('plane', 'hills3d', 'stairs3d'), False: ('flat', 'slopes', 'steps')}
 SECONDS = 1.0  # duration of zero actions before a picture is rendered
+_ARGUMENTS = re.compile(
+    r'\b(root|spatial|turn|end_effectors|fall_links|balance_inertia)=(True|False)?'
+)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Prints the properties of the character in a file, then renders it on three terrains."""
+    """Prints the properties of the character in a file, then renders it on three terrains.
+
+    Raises:
+      ValueError: the file cannot be used, or its simulation diverges on one of the terrains.
+    """
     output = arguments.output or pathlib.Path(f'try_{arguments.file.stem}.png')
     files.check_path(output, rendering.IMAGE_SUFFIXES)
     suite = engine.load()
     from trl_suite import characters
 
     name = arguments.file.stem
-    spec = characters.from_file(
-        arguments.file, end_effectors=arguments.end_effectors, fall_links=arguments.fall_links,
-        root=arguments.root, spatial=arguments.spatial, turn=arguments.turn,
-        name=f'{name}_file' if name in characters.CHARACTERS else name,
-    )  # fmt: skip
+    try:
+        spec = characters.from_file(
+            arguments.file, end_effectors=arguments.end_effectors, fall_links=arguments.fall_links,
+            root=arguments.root, spatial=arguments.spatial, turn=arguments.turn,
+            balance_inertia=arguments.balance_inertia,
+            name=f'{name}_file' if name in characters.CHARACTERS else name,
+        )  # fmt: skip
+    except ValueError as error:
+        raise ValueError(_options(str(error))) from None
     pictures: list[np.ndarray] = []
+    unstable: list[str] = []
     for terrain in TERRAINS[spec.spatial]:
         environment = suite.build(spec, terrain=terrain, task='walk', task_kwargs={'random': 0})
         environment.reset()
         if not pictures:
             print(_report(spec, environment), flush=True)
         print(f'{terrain}: {_stand(environment)}', flush=True)
+        unstable += [terrain] if environment.info.get('diverged') else []
         pictures.append(rendering.frame(environment, 360, 480))
     rendering.film_strip(pictures, output, len(pictures))
     print(output)
+    if unstable:
+        raise ValueError(
+            f'{arguments.file}: its simulation diverges on {", ".join(unstable)}; expected a stable one: '
+            'are masses, inertias and gains right, and no bodies inside each other?'
+        )
+
+
+def _options(text: str) -> str:
+    """Returns a message with options of the command instead of arguments of `from_file`."""
+    return _ARGUMENTS.sub(
+        lambda found: f'--{"no-" * (found[2] == "False")}{found[1].replace("_", "-")}', text
+    )
 
 
 def _report(spec: CharacterSpec, environment: Environment) -> str:
@@ -70,7 +96,7 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
         f'facing: {looks}; expected along [1, 0]',
         f'links: {", ".join(spec.links)}',
         f'end effectors: {", ".join(spec.end_effectors)}; must not touch the ground: '
-        f'{", ".join(spec.fall_links)}',
+        f'{", ".join(spec.fall_links) or "none"}',
         f'pairs of its geoms that can collide: {pairs}; in contact at the start: {len(inside)}'
         + (f', up to {-min(inside):.2g} m deep' if inside else ''),
         tables.table(
@@ -80,7 +106,7 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
                 for (name, joint), kind, limit in joints
             ),
         ),
-        *(program.printable(f'note: {note}') for note in spec.notes),
+        *(program.printable(f'note: {_options(note)}') for note in spec.notes),
     ]
     return '\n'.join(lines)
 
