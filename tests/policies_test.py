@@ -375,8 +375,37 @@ class ActTest(parameterized.TestCase):
             hidden=(), blocks=(('a', 2),), weights=[weights], biases=[np.zeros(6)],
             mean=np.zeros(2), std=np.ones(2), choices=choices,
         )  # fmt: skip
-        found = policy(np.array([[1.0, 0.5], [0.5, 1.0]]))
-        np.testing.assert_allclose(found, [[0.7, -0.4], [1.0, -0.3]], atol=1e-6)  # 1.3 is clipped
+        seen = np.array([[1.0, 0.5], [0.5, 1.0]])
+        np.testing.assert_allclose(
+            policy(seen), [[0.7, -0.4], [1.0, -0.3]], atol=1e-6
+        )  # 1.3 is clipped
+        bounded = dataclasses.replace(policy, largest_change=0.25)
+        expected = choices + 0.25 * np.tanh([[0.2, 0.1], [0.4, -0.3]])
+        np.testing.assert_allclose(bounded(seen), np.minimum(expected, 1), atol=1e-6)
+        common = dataclasses.replace(bounded, weights=[weights[:, :4]], biases=[[0, 0, 0.1, 0]])
+        expected = choices + 0.25 * np.tanh([[0.3, 0.1], [0.2, 0.05]])
+        np.testing.assert_allclose(common(seen), np.minimum(expected, 1), atol=1e-6)
+        self.assertEqual(common(np.zeros((0, 2))).shape, (0, 2))
+
+    @parameterized.parameters((2, 5), (5, 20))
+    def test_changes_do_not_depend_on_the_batch(self, count, outputs):
+        random = np.random.default_rng(1)
+        one, other = (
+            make(
+                actions=tuple('abc'), choices=np.linspace(-1, 1, 3 * count).reshape(-1, 3),
+                weights=[random.normal(size=(7, 16)), random.normal(size=(16, outputs))],
+                biases=[np.zeros(16), np.zeros(outputs)], largest_change=0.3,
+            )
+            for _ in range(2)
+        )  # fmt: skip
+        observations = random.normal(size=(67, 7))
+        for policy in (one, policies.ensemble([one, other])):
+            together = policy(observations)
+            for n in (1, 2, 3, 31):
+                np.testing.assert_array_equal(policy(observations[-n:]), together[-n:])
+            np.testing.assert_array_equal(policy(observations[5]), together[5])
+        with self.assertRaisesRegex(ValueError, 'different largest_change'):
+            policies.ensemble([one, dataclasses.replace(other, largest_change=0.2)])
 
     def test_a_policy_can_use_some_columns_only(self):
         policy = make(
@@ -440,6 +469,13 @@ class ActTest(parameterized.TestCase):
         ({'choices': np.zeros((3, 2))}, r'weight_2: has shape \(5, 2\); expected \(5, 3\)'),
         ({'choices': np.zeros((2, 3))}, r'choices: has shape \(2, 3\); expected \(2, 2\)'),
         ({'choices': np.full((2, 2), 1.5)}, r'choices: expected at least one action, in \[-1, 1'),
+        ({'largest_change': 0.3}, 'largest_change: expected choices, and outputs that change them'),
+        (
+            {'choices': np.zeros((2, 2)), 'largest_change': 0.3},
+            'largest_change: expected choices, and outputs that change them',
+        ),
+        ({'largest_change': 0.0}, 'largest_change: expected a positive number; got 0.0'),
+        ({'largest_change': [0.3]}, r'largest_change: has shape \(1,\); expected \(\)'),
     )
     def test_malformed_fields_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):
@@ -528,8 +564,8 @@ class FileTest(FolderTest):
     def test_round_trip_of_optional_fields(self):
         policy = make(
             places=np.array([[3, 1]]), columns=np.array([0, 2, 8]), mean=np.zeros(3), std=np.ones(3),
-            weights=[np.ones((3, 4))], biases=[np.arange(4)],
-            choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)),
+            weights=[np.ones((3, 6))], biases=[np.arange(6)],
+            choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)), largest_change=0.3,
         )  # fmt: skip
         policies.save(policy, self.folder / 'p.npz')
         again = policies.load(self.folder / 'p.npz')

@@ -25,7 +25,8 @@ of observations, L the number of layers, c the number of inputs of the network: 
     activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
     layers       int ()      L
     weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
-    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b, or b + b a
+    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or with choices
+                             b, b + a or b + b a
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
     info         U ()        a JSON object: how the policy was trained
 
@@ -51,8 +52,9 @@ and, if the network uses only some columns, e.g. the near part of a height map:
 and, if it selects one of b actions, as mixtures of experts do:
 
     choices      float (b, a)  the action is the row whose output is the largest, of the first b; if
-                               there are b a more, row by row, those of this row are added, and the
-                               sum is clipped to [-1, 1]
+                               there are a more, they are added, or if there are b a more, row by
+                               row, those of this row, and the sum is clipped to [-1, 1]
+    largest_change  float ()   optional: what is added is this times the tanh of these outputs
 
 and, if the first l inputs form a line, e.g. of ground heights, or maps, to which C convolutions are
 applied; their outputs, position by position, and then the other c - l inputs are the inputs of
@@ -115,7 +117,9 @@ _MIRROR = {
     'action_index': ('iu', 1), 'action_sign': ('f', 1),
 }  # fmt: skip
 _SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
-_OPTIONAL = {'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2)}
+_OPTIONAL = {
+    'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2), 'largest_change': ('f', 0),
+}  # fmt: skip
 _LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
 _LINE_OPTIONAL = {'origin': ('iu', 0), 'grid': ('iu', 1)}
 

@@ -53,7 +53,10 @@ class Policy:
       columns: columns of the observation, after reflection and with these inputs, that the network
         uses, (c,); None for all.
       choices: actions of which the one with the largest of the first b outputs is selected, (b, a);
-        b a further outputs are changes that are added to them; None: the outputs are the action.
+        further outputs are changes that are added: b a, of each action, or a, of all; None: the
+        outputs are the action.
+      largest_change: the changes are this times the hyperbolic tangent of these outputs, (); None:
+        they are the outputs.
       convolution: convolutions of the first inputs, whose outputs are then inputs of `weights[0]`,
         followed by the other inputs; None for none.
       layer_norm: whether each fully connected layer but the last has layer normalisation before
@@ -79,6 +82,7 @@ class Policy:
     places: np.ndarray | None = dataclasses.field(default=None, repr=False)
     columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
     choices: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    largest_change: np.ndarray | None = None
     convolution: Convolution | None = dataclasses.field(default=None, repr=False)
     layer_norm: bool = False
 
@@ -119,12 +123,23 @@ class Policy:
         if self.choices is not None:
             last = len(self.choices)
             put('choices', checks.array('choices', self.choices, (last, a)))
-            if self.biases and np.shape(self.biases[-1])[-1:] == (last * (1 + a),):
-                last *= 1 + a
+            outputs = (
+                np.shape(self.biases[-1])[-1] if self.biases and np.ndim(self.biases[-1]) else 0
+            )
+            if outputs in (last + a, last * (1 + a)):
+                last = outputs
             if not last or np.abs(self.choices).max() > 1:
                 raise ValueError('choices: expected at least one action, in [-1, 1]')
             if self.mirror is not None:
                 raise ValueError('choices: a policy with a mirror cannot have them')
+        if self.largest_change is not None:
+            put('largest_change', checks.array('largest_change', self.largest_change, ()))
+            if not self.largest_change > 0:
+                raise ValueError(
+                    f'largest_change: expected a positive number; got {self.largest_change}'
+                )
+            if self.choices is None or last == len(self.choices):
+                raise ValueError('largest_change: expected choices, and outputs that change them')
         layers = len(self.weights)
         if not layers or len(self.biases) != layers:
             raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
@@ -308,7 +323,11 @@ class Policy:
             chosen, changes = x[:, :number].argmax(1), x[:, number:]
             x = self.choices[chosen]
             if changes.size:
-                changes = changes.reshape(len(x), *self.choices.shape)[np.arange(len(x)), chosen]
+                changes = changes.reshape(len(x), -1, len(self.actions))
+                own = np.minimum(chosen, changes.shape[1] - 1)  # 0 if all have the same
+                changes = changes[np.arange(len(x)), own]
+                if self.largest_change is not None:
+                    changes = self.largest_change * np.tanh(changes)
                 x = _bounded(x + changes, 1.0)
         if self.mirror is not None and left is not None:
             x = self.mirror.unmirror_action(x, left)
@@ -351,7 +370,7 @@ def ensemble(members: Sequence[Policy]) -> Policy:
     for name in ('blocks', 'actions', 'quantity', 'clip', 'activation', 'layer_norm'):
         if any(getattr(each, name) != getattr(first, name) for each in members):
             raise ValueError(f'members: have different {name}')
-    for name in ('mean', 'std', 'places', 'columns', 'choices'):
+    for name in ('mean', 'std', 'places', 'columns', 'choices', 'largest_change'):
         if not all(np.array_equal(getattr(each, name), getattr(first, name)) for each in members):
             raise ValueError(f'members: have different {name}')
     if any(len(each.networks) > 1 for each in members):
