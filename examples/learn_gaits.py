@@ -667,9 +667,9 @@ class Learner:
             self.begin_optimizer()  # with the constant rate
         self.seconds['learning'] += time.process_time() - begin
 
-    def exported(self) -> policies.Policy:
-        """Returns the target network, or the ensemble, as a policy without PyTorch."""
-        return policies.ensemble(list(map(self._policy, self.members or [self.target])))
+    def exported(self, networks: Sequence[Network] = ()) -> policies.Policy:
+        """Returns networks as a policy without PyTorch; by default the ensemble or the target network."""
+        return policies.ensemble(list(map(self._policy, networks or self.members or [self.target])))
 
     def _policy(self, network: Network) -> policies.Policy:
 

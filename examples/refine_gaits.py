@@ -10,6 +10,9 @@ to. The policy that is written selects the action with the largest logit. Its we
 average of those of all updates (setting `averaged`), in which their random changes cancel. Its files
 are those of `learn_gaits.py`.
 
+With `--changes all` the networks also learn a change of the selected action, from changes with noise, or
+with `--changes each` one for each base action. They are 0 at the beginning.
+
 After a fall most simulations return to a state a few cycles earlier, as in `learn_gaits.py`; these
 retries end a trajectory, and the actions after them are those of the policy.
 
@@ -40,6 +43,7 @@ from torch import nn
 from torch.optim import swa_utils
 
 from trl_suite import policies
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 
 
@@ -67,6 +71,12 @@ class Settings:
     lambda_: float = 0.95
     clip: float = 0.2
     kl: float = 0.02  # an update of the policy stops at this divergence
+    changes: str = ''  # changes of the selected action: one of `CHANGES`
+    largest_change: float = 0.3  # of an action in [-1, 1]
+    noise: float = 0.05  # standard deviation of the noise of changes
+    change_rate: float = 1e-5  # first learning rate of the layer of changes, adapted to
+    change_kl: float = 0.01  # the divergence of changes in an update
+    changes_first: float = 0  # first cycles, in which only this layer and the value are trained
     gradient_norm: float = 0.5
     averaged: float = 1e5  # cycles over which the weights of the policy are averaged; 0: not
     greedy: float = 0.34  # share of simulations that do not return to earlier states
@@ -116,6 +126,8 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'samples': 1.2e5, 'num_envs': 48, 'averaged': 0.0, 'evaluate_every': 12288,
     },
 }  # fmt: skip
+CHANGES = '', 'all', 'each'  # none; the same for all base actions; one for each
+CHANGE_RATES = 1e-7, 1e-3  # smallest and largest learning rate of the layer of changes
 VALUE_SCALE = 5.0  # outputs of the value network are multiplied by it
 # Settings that may change when a run is continued.
 _CHANGEABLE = 'samples', 'write_every', 'evaluate_every'
@@ -132,9 +144,12 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
     """Returns the settings of the simulations.
 
     Raises:
-      ValueError: actors change the base actions, an environment is unknown or has no gait.
+      ValueError: actors of Q-learning change the base actions, the kind of changes is unknown, or an
+        environment is unknown or has no gait.
     """
     s = settings
+    if s.changes not in CHANGES:
+        raise ValueError(errors.unknown('kind of changes', s.changes, CHANGES))
     if s.first.actors:
         raise ValueError(
             f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
@@ -145,6 +160,19 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
     )  # fmt: skip
     learn_gaits.environments_of(id_, own)
     return own
+
+
+def zero_layer(inputs: int, outputs: int) -> nn.Linear:
+    """Returns a layer whose outputs are 0."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def of_action(changes: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
+    """Returns the changes (n, a) of base actions from those of each of them, or of all."""
+    return changes[torch.arange(len(number)), number.clamp(max=changes.shape[1] - 1)]
 
 
 class Refiner:
@@ -162,17 +190,34 @@ class Refiner:
         self.learner = learner = learn_gaits.Learner(id_, seed, simulated(id_, s), threads)
         learner.begin_with(initial)
         networks = [copy.deepcopy(learner.network) for _ in initial.networks]
+        self.value = copy.deepcopy(learner.network)
+        features = self.value.last.in_features
+        self.value.last = zero_layer(features, 1)
+        count, size = learner.choices.shape
+        changes = {'': 0, 'all': size, 'each': count * size}[s.changes]
+        known = initial.biases[-1].shape[-1] - len(initial.choices)
+        largest = np.float32(s.largest_change)
+        if known and (known, initial.largest_change) != (changes, largest):
+            raise ValueError(
+                f'{initial.id} has {known} changes of at most {initial.largest_change}; expected '
+                f'{changes} of at most {largest}, as in the settings'
+            )
         for number, network in enumerate(networks):
+            if changes:
+                network.actors = zero_layer(features, changes)
             learner.copy_weights(initial, number, network)
         self.policy = nn.ModuleList(networks)
         cycles = s.num_envs * s.horizon
         average = swa_utils.get_ema_multi_avg_fn(1 - cycles / max(s.averaged, cycles))
         self.average = swa_utils.AveragedModel(self.policy, multi_avg_fn=average)
-        self.value = copy.deepcopy(networks[0])
-        self.value.last = nn.Linear(self.value.last.in_features, 1)
-        nn.init.zeros_(self.value.last.weight)
-        nn.init.zeros_(self.value.last.bias)
-        self.policy_optimizer = torch.optim.Adam(self.policy.parameters(), s.learning_rate)
+        parts = {True: [], False: []}
+        for name, parameter in self.policy.named_parameters():
+            parts['.actors.' in name].append(parameter)
+        self.policy_optimizer = torch.optim.Adam(parts[False], s.learning_rate)
+        if changes:
+            group = {'params': parts[True], 'lr': s.change_rate}
+            self.policy_optimizer.add_param_group(group)
+        self.divergence = 0.0  # of the changes in the last update
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), s.value_rate)
 
     @property
@@ -180,10 +225,31 @@ class Refiner:
         """Number of cycles so far."""
         return self.learner.samples
 
-    def log_probabilities(self, seen: torch.Tensor) -> torch.Tensor:
-        """Returns the logarithms of the probabilities of all base actions, (n, b)."""
-        values = sum(network(seen) for network in self.policy) / len(self.policy)
-        return torch.log_softmax(self.settings.sharpness * values, 1)
+    def outputs(self, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the logarithms of the probabilities of all base actions, (n, b), and their changes.
+
+        The changes are (n, b, a), or (n, 1, a) if they are the same for all, or (n, 0, a).
+        """
+        s, n = self.settings, len(self.policy)
+        features = [network.features(seen) for network in self.policy]
+        values = sum(each.last(x) for each, x in zip(self.policy, features, strict=True)) / n
+        likely = torch.log_softmax(s.sharpness * values, 1)
+        actions = self.learner.choices.shape[1]
+        if not s.changes:
+            return likely, torch.zeros(len(seen), 0, actions)
+        changes = sum(each.actors(x) for each, x in zip(self.policy, features, strict=True)) / n
+        return likely, s.largest_change * changes.reshape(len(seen), -1, actions).tanh()
+
+    def density(
+        self, outputs: tuple[torch.Tensor, torch.Tensor], b: dict[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """Returns the log-probabilities of actions, up to a constant, (n,)."""
+        likely, changes = outputs
+        result = likely.gather(1, b['action'][:, None])[:, 0]
+        if changes.shape[1]:
+            away = (b['change'] - of_action(changes, b['action'])) / self.settings.noise
+            result = result - away.square().sum(1) / 2
+        return result
 
     def estimate(self, seen: torch.Tensor) -> torch.Tensor:
         """Returns the estimated sums of future rewards, (n,)."""
@@ -199,28 +265,34 @@ class Refiner:
 
         Returns:
           One row for each of these cycles: what the networks have seen, the number of the base action,
-          its log-probability, its advantage by GAE, and the target of the value.
+          its mean change and its change, if any, its log-probability, its advantage by GAE, and the
+          target of the value.
         """
         s, learner = self.settings, self.learner
         shape = s.horizon, s.num_envs
-        seen, likely, number, fell = [], [], np.zeros(shape, int), np.zeros(shape, bool)
-        reward, values = np.zeros(shape), np.zeros((s.horizon + 1, s.num_envs))
+        rows, fell, reward = [], np.zeros(shape, bool), np.zeros(shape)
+        values = np.zeros((s.horizon + 1, s.num_envs))
         for t in range(s.horizon):
-            seen.append(self.seen())
-            likely.append(self.log_probabilities(seen[-1]))
-            values[t] = self.estimate(seen[-1]).numpy()
-            below = likely[-1].exp().cumsum(1).numpy()
+            seen = self.seen()
+            likely, changes = outputs = self.outputs(seen)
+            values[t] = self.estimate(seen).numpy()
+            below = likely.exp().cumsum(1).numpy()
             drawn = learner.random.random((s.num_envs, 1)) * below[:, -1:]
-            number[t] = np.minimum((below < drawn).sum(1), below.shape[1] - 1)
-            reward[t], fell[t], _ = learner.run(learner.choices[number[t]])
+            number = np.minimum((below < drawn).sum(1), below.shape[1] - 1)
+            taken, row = learner.choices[number], {'seen': seen, 'action': torch.from_numpy(number)}
+            if s.changes:
+                row['mean'] = of_action(changes, row['action'])
+                noise = learner.random.standard_normal(row['mean'].shape, np.float32)
+                row['change'] = row['mean'] + s.noise * torch.from_numpy(noise)
+                taken = np.clip(taken + row['change'].numpy(), -1, 1)
+            row['log_probability'] = self.density(outputs, row)
+            rows.append(row)
+            reward[t], fell[t], _ = learner.run(taken)
         values[-1] = self.estimate(self.seen()).numpy()
         following = np.where(fell, 0.0, values[1:])
         advantage = ppo.advantages(reward, values[:-1], following, fell, s.gamma, s.lambda_)
-        action = torch.from_numpy(number.ravel())
         return {
-            'seen': torch.cat(seen),
-            'action': action,
-            'log_probability': torch.cat(likely).gather(1, action[:, None])[:, 0],
+            **{name: torch.cat([row[name] for row in rows]) for name in rows[0]},
             'advantage': torch.from_numpy(advantage.astype(np.float32)).flatten(),
             'target': torch.from_numpy((advantage + values[:-1]).astype(np.float32)).flatten(),
         }
@@ -231,8 +303,8 @@ class Refiner:
         only_value = learner.updates < s.value_first
         share = min(1.0, self.samples / s.samples)
         rate = s.learning_rate + share * (s.last_learning_rate - s.learning_rate)
-        for group in self.policy_optimizer.param_groups:
-            group['lr'] = rate
+        selection, *changes = self.policy_optimizer.param_groups
+        selection['lr'] = rate if self.samples >= s.changes_first else 0.0
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         for _ in range(s.value_epochs if only_value else s.epochs):
@@ -246,13 +318,11 @@ class Refiner:
                 learner.loss = float(loss.detach())
                 if only_value:
                     continue
-                likely = self.log_probabilities(b['seen'])
-                likely = likely.gather(1, b['action'][:, None])[:, 0]
-                change = likely - b['log_probability']
-                if float(-change.detach().mean()) > s.kl:
+                growth = self.density(self.outputs(b['seen']), b) - b['log_probability']
+                if float(-growth.detach().mean()) > s.kl:
                     only_value = True  # in the rest of this update
                     continue
-                ratio = change.exp()
+                ratio = growth.exp()
                 gain = torch.minimum(
                     ratio * b['advantage'],
                     ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
@@ -261,6 +331,14 @@ class Refiner:
                 (-gain.mean()).backward()
                 nn.utils.clip_grad_norm_(self.policy.parameters(), s.gradient_norm)
                 self.policy_optimizer.step()
+        if changes and learner.updates >= s.value_first:
+            with torch.no_grad():
+                means = of_action(self.outputs(batch['seen'])[1], batch['action'])
+            moved = (means - batch['mean']).square().sum(1).mean()
+            self.divergence = float(moved) / (2 * s.noise**2)
+            if not s.change_kl / 1.5 <= self.divergence <= 1.5 * s.change_kl:
+                factor = 1.5 if self.divergence < s.change_kl else 1 / 1.5
+                changes[0]['lr'] = float(np.clip(changes[0]['lr'] * factor, *CHANGE_RATES))
         self.average.update_parameters(self.policy)
         learner.updates += 1
 
@@ -273,14 +351,21 @@ class Refiner:
         seconds['simulation'] += middle - begin
         seconds['learning'] += time.process_time() - middle
 
+    def evaluate(self) -> dict[str, Any]:
+        """Returns the new point of the curve, with the divergence and the learning rate of changes."""
+        point = self.learner.evaluate()
+        if self.settings.changes:
+            point['divergence'] = self.divergence
+            point['change_rate'] = self.policy_optimizer.param_groups[1]['lr']
+        return point
+
     def exported(self) -> policies.Policy:
         """Returns the policy without PyTorch."""
         networks = copy.deepcopy(self.average.module).requires_grad_(False)
-        if len(networks) > 1:
-            self.learner.members = list(networks)
-        else:
-            self.learner.target = networks[0]
-        return self.learner.exported()
+        policy = self.learner.exported(list(networks))
+        if not self.settings.changes:
+            return policy
+        return dataclasses.replace(policy, largest_change=self.settings.largest_change)
 
     def get_state(self) -> dict[str, Any]:
         """Returns all that a checkpoint holds."""
@@ -355,7 +440,7 @@ def train(
                 bar.update(refiner.samples - begin)
                 ends = refiner.samples >= s.samples
                 if ends or refiner.samples // s.evaluate_every > begin // s.evaluate_every:
-                    point = refiner.learner.evaluate()
+                    point = refiner.evaluate()
                     bar.set_postfix(distance=f'{point.get("distance", np.nan):.1f} m')
                     refiner.write(folder, before, threads)
                 if ends or refiner.samples // s.write_every > begin // s.write_every:
@@ -365,7 +450,7 @@ def train(
 
 def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(
-        __doc__.splitlines()[0], 'cycles', {'start': {}}
+        __doc__.splitlines()[0], 'cycles', {'start': {}, 'changes': {'choices': CHANGES}}
     )
     curve = train(id_, seed, settings_for(id_, **changes), folder, threads)
     learn_gaits.report(curve, folder)

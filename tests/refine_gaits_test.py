@@ -39,11 +39,12 @@ def make(**changes):
 
 
 class RefineTest(parameterized.TestCase):
-    def test_it_begins_with_the_mean_values_of_the_initial_policy(self):
-        refiner, initial = make()
+    @parameterized.parameters(*refine_gaits.CHANGES)
+    def test_it_begins_with_the_mean_values_of_the_initial_policy(self, changes):
+        refiner, initial = make(changes=changes)
         observation = refiner.learner.observation
         with torch.no_grad():
-            likely = refiner.log_probabilities(refiner.seen()).exp()
+            likely = refiner.outputs(refiner.seen())[0].exp()
         np.testing.assert_allclose(likely.sum(1), 1, rtol=1e-5)
         choices = refiner.learner.choices
         chosen = choices[likely.argmax(1).numpy()]
@@ -54,6 +55,7 @@ class RefineTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'first': dataclasses.replace(FIRST, action='both')}, 'action'),
+        ({'changes': 'every'}, "unknown kind of changes 'every'"),
         ({'also': ('FSM_Hoper2D_*',)}, 'did you mean'),
         ({'also': ('PD_Biped2D_Gaps_Terrain-v0',)}, 'no gait'),
     )
@@ -72,7 +74,7 @@ class RefineTest(parameterized.TestCase):
         run = refiner.learner.run
         refiner.learner.run = lambda taken: (np.zeros(8), np.zeros(8, bool), None)
         with torch.no_grad():
-            likely = refiner.log_probabilities(refiner.seen()).exp().numpy()
+            likely = refiner.outputs(refiner.seen())[0].exp().numpy()
         for _ in range(500):
             batch = refiner.collect()
             np.add.at(counts, batch['action'].numpy(), 1)
@@ -108,15 +110,53 @@ class RefineTest(parameterized.TestCase):
         self.assertGreater(np.mean(chosen[-16:]), 0.9)
         self.assertLess(np.mean(chosen[:16]), 0.6)
 
+    @parameterized.parameters('all', 'each')
+    def test_it_learns_changes_that_pay_at_a_constant_divergence(self, changes):
+        refiner, initial = make(
+            num_envs=16, value_first=0, horizon=16, changes=changes, changes_first=np.inf, kl=1.0,
+            averaged=0.0,
+        )  # fmt: skip
+        choices = refiner.learner.choices
+
+        def run(taken):
+            number = np.abs(taken[:, None] - choices).sum(2).argmin(1)
+            return 9 * (taken - choices[number])[:, 1], np.ones(16, bool), None
+
+        refiner.learner.run = run
+        found = []
+        for _ in range(40):
+            refiner.advance()
+            found.append(refiner.divergence)
+        self.assertBetween(np.median(found[10:]), 0.005, 0.02)
+        observation = refiner.learner.observation
+        policy = refiner.exported()
+        inner = np.abs(initial(observation)[:, 1]) < 0.8
+        change = (policy(observation) - initial(observation))[inner]
+        self.assertGreater(change[:, 1].min(), 0.1)
+        self.assertLess(np.abs(change).max(), refine_gaits.Settings.largest_change)
+        self.assertLess(np.abs(np.delete(change, 1, 1)).mean(), 0.05)
+        point = refiner.evaluate()
+        self.assertEqual(point['divergence'], found[-1])
+        self.assertGreater(point['change_rate'], refine_gaits.Settings.change_rate)
+        # The selection has not been trained.
+        for one, other in zip(policy.networks, initial.networks, strict=True):
+            np.testing.assert_array_equal(one[1][0], other[1][0])
+        # The next run begins with these changes.
+        again = refine_gaits.Refiner(HOPPER, 1, refiner.settings, 1, policy)
+        np.testing.assert_array_equal(again.exported()(observation), policy(observation))
+        other = dataclasses.replace(refiner.settings, largest_change=0.2)
+        with self.assertRaisesRegex(ValueError, 'of at most 0.3.*; expected .* of at most 0.2'):
+            refine_gaits.Refiner(HOPPER, 1, other, 1, policy)
+
     def test_the_value_is_learnt_first(self):
         refiner, _ = make()
-        before = refiner.log_probabilities(refiner.seen()).detach()
+        before = refiner.outputs(refiner.seen())[0].detach()
         seen = refiner.seen()
         refiner.advance()
-        np.testing.assert_array_equal(refiner.log_probabilities(seen).detach(), before)
+        np.testing.assert_array_equal(refiner.outputs(seen)[0].detach(), before)
         self.assertTrue((refiner.estimate(seen) != 0).all())
         refiner.advance()
-        self.assertTrue((refiner.log_probabilities(seen).detach() != before).any())
+        self.assertTrue((refiner.outputs(seen)[0].detach() != before).any())
 
     @parameterized.parameters(0.0, 64.0)
     def test_the_weights_that_are_written_may_be_an_average(self, averaged):
@@ -134,7 +174,9 @@ class RefineTest(parameterized.TestCase):
         _, written, _ = refiner.exported().networks[0]
         np.testing.assert_allclose(written[-1], expected.T, rtol=1e-5, atol=1e-7)
 
-    @parameterized.parameters({}, {'also': (WALLS,), 'averaged': 96.0})
+    @parameterized.parameters(
+        {}, {'also': (WALLS,), 'averaged': 96.0}, {'changes': 'each', 'changes_first': 48.0}
+    )
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
         curves = []
         with tempfile.TemporaryDirectory() as name:
