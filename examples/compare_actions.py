@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import comparisons
@@ -48,7 +49,14 @@ def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -
             action=action, expert_cycles=0, evaluation_episodes=0, **common
         )
         curve = learn_gaits.train(id_, seed, settings, folder, 1)
-    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), EPISODES, SEED, 1)
+    return evaluated(id_, folder, curve, EPISODES)
+
+
+def evaluated(
+    id_: str, folder: pathlib.Path, curve: list[dict[str, Any]], episodes: int
+) -> dict[str, Any]:
+    """Returns the results of the policy of a run, and its learning curve."""
+    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), episodes, SEED, 1)
     keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     return {
         **{key: found[key] for key in keys},
@@ -56,18 +64,18 @@ def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -
     }
 
 
-def table(found: dict[str, Any]) -> str:
-    """Returns the results as Markdown."""
+def table(found: dict[str, Any], names: Mapping[str, str] = NAMES, episodes: int = EPISODES) -> str:
+    """Returns the results as Markdown; `names` are those of the kinds of actions."""
     results = found['results']
     seeds = sorted({int(key.rsplit('/', 1)[1]) for key in results})
     lines = [
-        f'Distance to the first fall in `{found["id"]}` after {found["cycles"]:g} cycles, mean of {EPISODES} '
+        f'Distance to the first fall in `{found["id"]}` after {found["cycles"]:g} cycles, mean of {episodes} '
         f'episodes, m; seeds {", ".join(map(str, seeds))}:',
         '',
         '| action | ' + ' | '.join(f'seed {seed}' for seed in seeds) + ' | mean | speed, m/s |',
         '| --- ' * (3 + len(seeds)) + '|',
     ]
-    for action, name in NAMES.items():
+    for action, name in names.items():
         of_seeds = [results.get(f'{action}/{seed}') for seed in seeds]
         done = [each for each in of_seeds if each is not None]
         if not done:
@@ -79,7 +87,7 @@ def table(found: dict[str, Any]) -> str:
     return '\n'.join(lines)
 
 
-def plot(found: dict[str, Any], path: pathlib.Path) -> None:
+def plot(found: dict[str, Any], path: pathlib.Path, names: Mapping[str, str] = NAMES) -> None:
     """Draws the learning curves; a last point, joined by a dotted line, is the final policy."""
     import matplotlib
 
@@ -87,7 +95,7 @@ def plot(found: dict[str, Any], path: pathlib.Path) -> None:
     from matplotlib import pyplot
 
     figure, axis = pyplot.subplots(figsize=(8, 4))
-    for colour, (action, name) in zip(pyplot.get_cmap('tab10').colors, NAMES.items(), strict=False):
+    for colour, (action, name) in zip(pyplot.get_cmap('tab10').colors, names.items(), strict=False):
         runs = [run for key, run in found['results'].items() if key.split('/')[0] == action]
         for run in runs:
             cycles, distance = np.array(run['curve']).T

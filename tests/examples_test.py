@@ -23,6 +23,7 @@ from trl_suite.vector import VectorEnvironment
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import checkpoints
 import compare_actions
+import compare_changes
 import compare_hierarchy
 import compare_transfer
 import evaluate_footsteps
@@ -113,6 +114,45 @@ class CompareActionsTest(FolderTest):
         self.assertEqual({name: getattr(settings, name) for name in expected}, expected)
         self.assertEqual(found['curve'], [[8, 3.0]])
         self.assertGreater(found['distance'], 2.0)
+
+
+class CompareChangesTest(FolderTest):
+    def test_kinds_differ_in_their_changes_only_and_continue(self):
+        asked, result = {}, {'distance': 9.0, 'distance_interval': [8, 10], 'median_distance': 7.0}
+
+        def train(id_, seed, settings, folder, threads):
+            asked[folder.relative_to(self.folder), settings.samples] = settings
+            folder.mkdir(parents=True, exist_ok=True)
+            policies.save(policies.reference(id_), folder / 'policy.npz')
+            return [{'samples': 8, 'distance': 3.0}]
+
+        for cycles in ('64', '128'):
+            argv = [
+                'compare_changes.py', '--cycles', cycles, '--runs', str(self.folder), '--json',
+                str(self.folder / f'{cycles}.json'), '--kinds', 'selection', 'each',
+            ]  # fmt: skip
+            with (
+                mock.patch.object(compare_changes.refine_gaits, 'train', train),
+                mock.patch.object(
+                    compare_actions.evaluation, 'evaluate', lambda *_: {**result, 'speed': 3.0}
+                ),
+                mock.patch.object(sys, 'argv', argv),
+                contextlib.redirect_stdout(io.StringIO()) as out,
+                contextlib.redirect_stderr(io.StringIO()),
+            ):
+                compare_changes.main()
+            self.assertIn('200 episodes', out.getvalue())
+            self.assertIn(
+                '| selection, and a change of each base action | 9 | 9 | 3.0 |', out.getvalue()
+            )
+        folders = [pathlib.Path(kind, 'seed_1') for kind in ('selection', 'each')]
+        self.assertCountEqual(asked, [(each, n) for each in folders for n in (64, 128)])
+        selection, each = (dataclasses.asdict(asked[folder, 64]) for folder in folders)
+        own = {'changes', 'changes_first'}
+        self.assertEqual({name for name in each if selection[name] != each[name]}, own)
+        self.assertEqual((selection['changes'], each['changes']), ('', 'each'))
+        self.assertEqual(selection['learning_rate'], selection['last_learning_rate'])
+        self.assertContainsSubset(compare_changes.OWN, compare_changes.NAMES)
 
 
 class CompareHierarchyTest(FolderTest):
