@@ -49,14 +49,14 @@ def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -
             action=action, expert_cycles=0, evaluation_episodes=0, **common
         )
         curve = learn_gaits.train(id_, seed, settings, folder, 1)
-    return evaluated(id_, folder, curve, EPISODES)
+    return evaluated(id_, folder, curve, EPISODES, SEED)
 
 
 def evaluated(
-    id_: str, folder: pathlib.Path, curve: list[dict[str, Any]], episodes: int
+    id_: str, folder: pathlib.Path, curve: list[dict[str, Any]], episodes: int, seed: int
 ) -> dict[str, Any]:
     """Returns the results of the policy of a run, and its learning curve."""
-    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), episodes, SEED, 1)
+    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), episodes, seed, 1)
     keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     return {
         **{key: found[key] for key in keys},
