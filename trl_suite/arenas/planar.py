@@ -165,7 +165,7 @@ class PlanarArena(composer.Arena):
         if x.ndim != 2 or len(x) != len(env_ids):
             raise ValueError(f'x has shape {x.shape}; expected ({len(env_ids)}, k)')
         found = np.empty(x.shape)
-        query(env_ids, x, self.ground, found)
+        query(env_ids, x, self._ground, found)
         return found
 
     def state(self, env_id: int) -> dict[str, Any]:

@@ -194,7 +194,7 @@ class SpatialArena(composer.Arena):
         if len(self._dof):
             sped = np.zeros(len(env_ids), bool)
             _keep_moving(
-                env_ids, xy, self._world.qpos, self._world.qvel, self.surroundings.arrays, sped
+                env_ids, xy, self._world.qpos, self._world.qvel, self.surroundings.pack, sped
             )
             changed = sorted({*changed, *env_ids[sped].tolist()})
         if changed:  # existing contacts refer to boxes that have moved

@@ -15,7 +15,7 @@ from trl_suite.kinematics.planar import (
 )
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, packed
 
 CLEARANCE = 0.001  # m; between links and ground after the initial placement
 
@@ -81,6 +81,7 @@ class PlanarFigure:
         """
         self._world = world
         self.arena.bind(world)
+        self._ground = packed(self.arena.ground)
         character = self.character
         scope = f'{character.mjcf_model.model}/'
         root = world.joint_addresses([f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')])
@@ -133,9 +134,7 @@ class PlanarFigure:
         """
         world = self._world
         world.reset(env_ids)
-        put_down(
-            env_ids, poses, rates, extents, self.body, self.arena.ground, world.qpos, world.qvel
-        )
+        put_down(env_ids, poses, rates, extents, self.body, self._ground, world.qpos, world.qvel)
         world.forward(env_ids)
 
     def feet(self) -> np.ndarray:

@@ -134,7 +134,7 @@ class Reference:
         found, column = self.features(phase), self.columns
         parts = (np.zeros((len(phase), 1)), found[:, column['height']], found[:, column['angles']])
         rates = (found[:, column['root_rate']], found[:, column['rates']])
-        extents = found[:, column['extents']].reshape(len(phase), 3, -1)
+        extents = np.ascontiguousarray(found[:, column['extents']]).reshape(len(phase), 3, -1)
         return np.concatenate(parts, axis=1), np.concatenate(rates, axis=1), extents
 
     def features(self, phase: np.ndarray) -> np.ndarray:

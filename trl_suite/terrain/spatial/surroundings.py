@@ -23,7 +23,7 @@ from trl_suite.terrain.spatial.windows import (
     Capacity,
     SpatialWindows,
 )
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, packed
 
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
 SPARE = 1.3  # factor applied to the largest number of boxes in these grounds
@@ -74,6 +74,7 @@ class Surroundings:
     Attributes:
       arrays: the windows, for the compiled functions of one simulation in
         `trl_suite.terrain.spatial.windows`.
+      pack: the same as one argument, see `trl_suite.util.compiled.packed`.
       grounds: grounds of each character.
       boxes: boxes of each window, sorted by x.
       centre: centres of the windows, m, (n, 2).
@@ -87,6 +88,7 @@ class Surroundings:
         self.grounds: list[SpatialGround | None] = [None] * n
         self.boxes: list[Boxes] = [NO_BOXES] * n
         self.arrays: SpatialWindows = spatial_ground.empty(n, capacity)
+        self.pack = packed(self.arrays)
         self._numbers = np.arange(n)
         ground = self.arrays
         self.centre, self.distance, self.direction = (
@@ -184,7 +186,7 @@ class Surroundings:
         Within 5 m of the character they continue straight on, even beyond the end of their path.
         """
         env_ids = self._numbers[env_ids]
-        _turn_all(env_ids, positions(xy, len(env_ids)), self.arrays)
+        _turn_all(env_ids, positions(xy, len(env_ids)), self.pack)
 
     def centres(self, env_ids: EnvIds = ALL) -> np.ndarray:
         """Centres of the moving boxes, m, (simulations, M, 2)."""
@@ -268,7 +270,7 @@ class Surroundings:
             raise ValueError(
                 f'x and y have shapes {x.shape} and {y.shape}; expected ({len(env_ids)}, k)'
             )
-        query(env_ids, x, y, self.arrays, out)
+        query(env_ids, x, y, self.pack, out)
 
     def _maps(
         self,
@@ -289,7 +291,7 @@ class Surroundings:
                 f'xy, heading and out have shapes {xy.shape}, {heading.shape} and {out.shape}; '
                 f'expected {expected[0]}, {expected[1]} and {expected[2]}'
             )
-        query(env_ids, xy, heading, self.arrays, out)
+        query(env_ids, xy, heading, self.pack, out)
 
     # State.
 
