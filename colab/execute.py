@@ -58,12 +58,20 @@ def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     )
     for cell in notebook.cells:
         cell.metadata = nbformat.NotebookNode()
+        if 'outputs' in cell:
+            cell.outputs = [output for output in cell.outputs if not _is_notice(output)]
         for output in cell.get('outputs', ()):
             if output.get('name') == 'stderr':
                 raise ValueError(f'{cell.source}\n\nwrote to stderr:\n{output.text}')
             if '<video' in output.get('data', {}).get('text/html', ''):
                 del output.data['text/html']
     return notebook
+
+
+def _is_notice(output: nbformat.NotebookNode) -> bool:
+    """Whether an output only tells that functions were compiled."""
+    lines = output.text.splitlines() if output.get('name') == 'stderr' else ['']
+    return all(line.startswith('trl_suite: ') for line in lines)
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from helpers import FolderTest
 from trl_suite import rendering, suite
 from trl_suite.arenas import PlanarArena, scene
 from trl_suite.rendering import overlays, replays, web_meshes, web_scene, web_server
+from trl_suite.util import notices
 from trl_suite.viewing import browser, session
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
@@ -359,6 +360,24 @@ class BrowserTest(parameterized.TestCase):
         self.assertIn('mine.npz', tell.call_args_list[1].args[0])
         self.assertEqual(viewer._panel._fitted[0].value, 'plane')
         self.assertEqual(viewer._panel._policy.value, policy)
+
+    def test_browsers_are_told_of_waits_while_it_runs(self):
+        viewer = browser.Browser(DOG, 'zero', port=0)
+        viewer.choose_environment(DOG)
+
+        def load(*_):
+            notices._say('compiling')
+            viewer.stop()
+            raise ValueError('refused')
+
+        before = list(notices.listeners)
+        with (
+            mock.patch.object(viewer, '_load', load),
+            mock.patch.object(viewer._panel, 'tell') as tell,
+        ):
+            viewer.run()
+        self.assertEqual([call.args[0] for call in tell.call_args_list], ['compiling', 'refused'])
+        self.assertEqual(notices.listeners, before)
 
     @parameterized.parameters(
         ('127.0.0.1', '127.0.0.1', False), ('localhost', 'localhost', False),

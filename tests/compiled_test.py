@@ -1,6 +1,7 @@
 """Compiled functions: supported features, and the cache of their machine code."""
 
 import contextlib
+import errno
 import hashlib
 import io
 import math
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import textwrap
 import time
+import types
 import unittest
 import unittest.mock
 from typing import NamedTuple
@@ -21,14 +23,14 @@ import numba
 import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
-from helpers import FolderTest
+from helpers import FolderTest, besides_notices
 from numba.core import event
 
 import trl_suite
 from trl_suite import suite
 from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.util import compiled as module
-from trl_suite.util import interrupts, machine_code
+from trl_suite.util import files, interrupts, machine_code, notices
 from trl_suite.util.compiled import (
     compiled,
     compiled_inline,
@@ -162,29 +164,190 @@ class FunctionTest(parameterized.TestCase):
         self.assertEqual(twice.function(4), 8)
         self.assertEqual(twice.__name__, 'twice')
 
-    def test_long_compilations_are_announced_on_a_terminal(self):
-        for terminal, seconds, lines in (
-            (True, (0.2,), 1), (True, (0.2, 0.2), 1), (True, (0.06, 0.06, 0.2), 1),
-            (True, (0.0, 0.0), 0), (False, (0.2,), 0),
+
+class NoticeTest(parameterized.TestCase):
+    """What users are told while functions are compiled, and when they are not."""
+
+    COMPILING = 'compiling functions for this machine, once; it usually takes 10 to 30 s'
+
+    def setUp(self):
+        super().setUp()
+        self.told, self.now, self.timer = [], 0.0, None
+        folder = pathlib.Path(self.enter_context(tempfile.TemporaryDirectory()), 'hash')
+        for owner, name, value in (
+            (notices, 'listeners', [self.told.append]), (notices, 'cache_folder', lambda: folder),
+            (notices.threading, 'Timer', self._start), (notices.time, 'monotonic', lambda: self.now),
         ):  # fmt: skip
-            stream, announcer = io.StringIO(), module._Announcer()
-            stream.isatty = lambda terminal=terminal: terminal
+            self.enter_context(unittest.mock.patch.object(owner, name, value))
+        self.compiling = notices.Compiling()
+
+    def _start(self, seconds, action):
+        self.timer = unittest.mock.Mock(due=self.now + seconds, action=action)
+        self.timer.cancel = lambda: setattr(self, 'timer', None)
+        return self.timer
+
+    def rest(self, seconds):
+        until = self.now + seconds
+        while self.timer is not None and self.timer.due <= until:
+            self.now, timer, self.timer = self.timer.due, self.timer, None
+            timer.action()
+        self.now = until
+
+    def compile(self, seconds, waited=0.0):
+        self.compiling.begin()
+        if waited:
+            with self.compiling.waiting():
+                self.rest(waited)
+        self.rest(seconds - waited)
+        self.compiling.end()
+
+    @parameterized.parameters(
+        ((0.4,), []), ((0.3, 0.3), [COMPILING, 'compiled in 1 s']),
+        ((7.0, 0.1, 5.0), [COMPILING, 'compiled in 12 s']), ((0.4, -3.0, 0.4), []),
+        ((3.0, -3.0, 4.0), [
+            COMPILING, 'compiled in 3 s', COMPILING, 'compiled in 4 s',
+        ]),
+    )  # fmt: skip
+    def test_long_compiling_is_told_of(self, durations, told):
+        """Of parts that follow each other at once, and after pauses, the negative numbers."""
+        for seconds in durations:
+            if seconds < 0.0:
+                self.rest(-seconds)
+            else:
+                self.compile(seconds)
+        self.rest(3.0)
+        self.assertEqual(self.told, told)
+
+    def test_within_a_second(self):
+        self.compiling.begin()
+        self.rest(0.9)
+        self.assertEqual(self.told, [self.COMPILING])
+
+    def test_environments_and_how_long_they_took(self):
+        """Also if parts are compiled by `make`, `reset` and `step`, with pauses."""
+        for last in ('it usually takes 10 to 30 s', 'it took 9 s the last time'):
+            self.compiling = notices.Compiling()  # as in a new process
+            for name in ('dog', 'goat'):
+                self.compiling.about(name)
+                self.compile(4.0)
+                self.rest(3.0)
+                self.compile(5.0)
+            self.rest(3.0)
+            self.assertEqual(
+                self.told[0], f'compiling functions of dog for this machine, once; {last}'
+            )
+            self.assertEqual(self.told[-1], 'compiled in 5 s')
+            self.assertLen(self.told, 8)
+            self.told.clear()
+
+    def test_waiting_for_another_process(self):
+        self.compile(9.0, waited=5.0)
+        self.rest(3.0)
+        self.assertEqual(self.told, [
+            'waiting for another process that compiles functions; it usually takes 10 to 30 s',
+            'compiled in 9 s, 5 s of them by another process',
+        ])  # fmt: skip
+
+    @parameterized.parameters('', '[1]', '{"": "x"}', '{"": null}')
+    def test_a_damaged_record(self, content):
+        notices._record(notices.cache_folder()).write_text(content)
+        self.compile(3.0)
+        self.rest(3.0)
+        self.assertEqual(self.told, [self.COMPILING, 'compiled in 3 s'])
+
+    def test_streams(self):
+        closed = io.StringIO()
+        closed.close()
+        for stream, text in ((io.StringIO(), 'trl_suite: hello\n'), (closed, None), (None, None)):
             with (
-                unittest.mock.patch.object(module, 'PATIENCE', 0.1),
                 contextlib.redirect_stderr(stream),
+                contextlib.redirect_stdout(io.StringIO()) as out,
             ):
-                for each in seconds:
-                    announcer.begin()
-                    announcer.begin()  # a function that the first one calls
-                    announcer.end()
-                    time.sleep(each)
-                    announcer.end()
-            self.assertLen(stream.getvalue().splitlines(), lines)
+                notices.print_to_stderr('hello')
+            self.assertEmpty(out.getvalue())
+            if text is not None:
+                self.assertEqual(stream.getvalue(), text)
+
+
+class LockTest(FolderTest):
+    """A function that another process compiles is waited for; see `trl_suite.util.machine_code`."""
+
+    def setUp(self):
+        super().setUp()
+        self.locked, self.busy = set(), lambda: False
+        flags = {'LOCK_EX': 2, 'LOCK_NB': 4, 'LOCK_UN': 8, 'lockf': self._lockf}
+        for owner, name, value in (
+            (files, 'fcntl', types.SimpleNamespace(**flags)),
+            (module, 'cache_folder', lambda: self.folder / 'hash'),
+        ):
+            self.enter_context(unittest.mock.patch.object(owner, name, value))
+        (self.folder / 'hash').mkdir()
+        self.addCleanup(machine_code._lock_file.cache_clear)
+
+    def _lockf(self, file, operation, size, place):
+        if operation == 8:
+            self.locked.discard(place)
+        elif self.busy():
+            raise OSError(errno.EAGAIN, 'busy')
+        else:
+            self.locked.add(place)
+
+    @parameterized.parameters(1, 2)
+    def test_an_interrupt_ends_the_wait(self, depth):
+        """Of a function, and of one that it calls, while interrupts are postponed."""
+        function, before = fresh(), signal.getsignal(signal.SIGINT)
+
+        def busy():
+            if len(machine_code._pending) == depth:
+                signal.raise_signal(signal.SIGINT)
+                return True
+            return False
+
+        self.busy = busy
+        with self.assertRaises(KeyboardInterrupt):
+            function(1.0)
+        self.assertEqual((self.locked, machine_code._pending), (set(), []))
+        self.assertIs(signal.getsignal(signal.SIGINT), before)
+        self.busy = lambda: False
+        self.assertEqual(function(1.0), 7.0)
+
+    def test_a_wait_has_a_limit(self):
+        """A process that was stopped keeps its locks. Only the first is waited for."""
+        self.enter_context(unittest.mock.patch.object(machine_code, 'limit', 0.3))
+        self.busy = unittest.mock.Mock(return_value=True)
+        self.assertEqual(fresh()(1.0), 7.0)
+        self.assertEqual(machine_code.limit, 0.0)
+        self.assertBetween(self.busy.call_count, 3, 12)
+
+    def test_locks_are_released_after_errors(self):
+        with self.assertRaises(numba.core.errors.NumbaError):
+            compiled(allocates.function)(3)
+        self.assertEqual((self.locked, machine_code._pending), (set(), []))
+
+    def test_file_systems_without_locks(self):
+        self.busy = unittest.mock.Mock(side_effect=OSError(errno.ENOLCK, 'no locks'))
+        self.assertEqual(fresh()(1.0), 7.0)
 
 
 @compiled
 def double(x):
     return 2.0 * x
+
+
+@compiled
+def triple(x):
+    return 3.0 * x
+
+
+@compiled
+def more(x):
+    return triple(x) + 4.0
+
+
+def fresh():
+    """Returns a function that has yet to be compiled, as has the one that it calls."""
+    triple._made.clear()
+    return compiled(more.function)
 
 
 class InterruptTest(parameterized.TestCase):
@@ -281,10 +444,10 @@ class CacheTest(FolderTest):
             [sys.executable, '-c', textwrap.dedent(script)], capture_output=True, text=True,
             check=True, cwd=self.folder, env=self.environ(**variables),
         )  # fmt: skip
-        return done.stdout.split(), done.stderr
+        return done.stdout.split(), besides_notices(done.stderr)
 
     def folders(self, base=None):
-        return sorted((base or self.cache).glob('trl_suite/kernels/*'))
+        return sorted((base or self.cache).glob('trl_suite/kernels/*/'))
 
     def test_code_is_cached_per_state_of_the_sources(self):
         self.assertEqual(self.ask(), (['11.0'], ''))
@@ -301,19 +464,23 @@ class CacheTest(FolderTest):
         self.assertEqual(self.ask()[0], ['11.0'])
         self.assertLen(self.folders(), 2)
 
-    def test_only_compiling_is_announced(self):
-        """Loading code from the cache is not, however long it takes."""
+    def test_only_compiling_is_told_of(self):
+        """Loading code from the cache is not, nor what other users of Numba compile."""
         script = f"""
-            import sys
-            from trl_suite.util import compiled
-            compiled.PATIENCE, sys.stderr.isatty = 0.0, lambda: True
-            {ASK}"""
-        self.assertStartsWith(self.ask(script)[1], 'trl_suite: compiling for this machine, once;')
-        self.assertEqual(self.ask(script), (['11.0'], ''))
-        other = """
-            import numba
-            print(numba.njit(lambda x: x + 1.0)(1.0))"""
-        self.assertEqual(self.ask(script + other), (['11.0', '2.0'], ''))
+            import time, numba
+            from trl_suite.util import notices
+            notices.PATIENCE, notices.PAUSE = 0.0, 0.1
+            {ASK}
+            numba.njit(lambda x: x + 1.0)(1.0)
+            time.sleep(0.5)"""
+        for last in ('it usually takes 10 to 30 s', 'it took [0-9]+ s the last time'):
+            out, told = self.start(script).communicate()
+            self.assertEqual(out, '11.0\n')
+            begin = f'trl_suite: compiling functions for this machine, once; {last}'
+            self.assertRegex(told, f'^{begin}\ntrl_suite: compiled in [0-9]+ s\n$')
+            self.assertEqual(self.start(script).communicate(), ('11.0\n', ''))
+            for path in self.cache.rglob('*.nbc'):
+                path.unlink()
 
     def test_all_sources_matter(self):
         """Compiled functions hold constants of modules that have no compiled functions."""
@@ -356,7 +523,7 @@ class CacheTest(FolderTest):
         """)
         self.assertEqual(found, ['11.0'])
         self.assertEqual(warned.count('compiled code cannot be kept in'), 1)
-        self.assertEmpty([path for path in self.cache.rglob('*') if path.is_file()])
+        self.assertEmpty([*self.cache.rglob('*.nbc')])
 
     def test_damaged_files(self):
         """Those that are cut off or in which a bit is flipped are compiled and written again."""
@@ -398,19 +565,61 @@ class CacheTest(FolderTest):
         """)
         self.assertEqual(found, ['3.0'])
 
+    def start(self, script):
+        return subprocess.Popen(
+            [sys.executable, '-c', textwrap.dedent(script)], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, env=self.environ(), cwd=self.folder,
+        )  # fmt: skip
+
     def test_processes_that_compile_at_once(self):
-        """Also if all of them have the same number, as in containers that share the folder."""
-        script = f'import os; os.getpid = lambda: 7; {ASK}'
+        """Each function is compiled once, also if all have one number, as in several containers."""
         running = [
-            subprocess.Popen([sys.executable, '-c', script], stdout=subprocess.PIPE,
-                             stderr=subprocess.PIPE, text=True, env=self.environ(), cwd=self.folder)
+            self.start("""
+                import os, pathlib, time
+                os.getpid = lambda: 7
+                from numba.core import event
+                from trl_suite.util import compiled
+                from trl_suite.outer import outer
+                compiled._numba(), compiled.cache_folder()
+                pathlib.Path(f'ready{time.perf_counter_ns()}').touch()
+                while len(list(pathlib.Path().glob('ready*'))) < 3:
+                    time.sleep(0.001)
+                with event.install_recorder('numba:compile') as found:
+                    print(outer(1.0), len(found.buffer) // 2)
+            """)
             for _ in range(3)
-        ]  # fmt: skip
-        self.assertEqual([each.communicate() for each in running], [('11.0\n', '')] * 3)
-        files = [path for folder in self.folders() for path in folder.iterdir()]
-        self.assertEqual({path.suffix for path in files}, {'.nbc'})
-        for path in files:
+        ]
+        ended = [each.communicate() for each in running]
+        self.assertEqual([out.split()[0] for out, _ in ended], ['11.0'] * 3)
+        paths = [path for folder in self.folders() for path in folder.iterdir()]
+        self.assertEqual({path.suffix for path in paths}, {'.nbc'})
+        self.assertLen(paths, sum(int(out.split()[1]) for out, _ in ended))
+        for path in paths:
             machine_code._read(path)
+
+    @unittest.skipIf(files.fcntl is None, 'needs locks')
+    def test_a_process_that_is_killed_while_it_compiles(self):
+        self.ask(FOLDER)
+        holder = self.start("""
+            import fcntl, pathlib, signal
+            file = next(pathlib.Path('cache').glob('trl_suite/kernels')).joinpath('lock').open('ab')
+            fcntl.lockf(file, fcntl.LOCK_EX)
+            print('locked', flush=True)
+            signal.pause()
+        """)
+        self.assertEqual(holder.stdout.readline(), 'locked\n')
+        waiting = self.start(
+            f'from trl_suite.util import notices; notices.PATIENCE = 0.1; {ASK}; import time; time.sleep(3)'
+        )
+        self.assertStartsWith(waiting.stderr.readline(), 'trl_suite: waiting for another process')
+        self.assertIsNone(waiting.poll())
+        holder.kill()
+        holder.communicate()
+        out, told = waiting.communicate()
+        self.assertEqual(out, '11.0\n')
+        self.assertRegex(
+            told, r'^trl_suite: compiled in \d+ s, \d+ s of them by another process\n$'
+        )
 
     @parameterized.parameters(
         *[('fork', True), ('fork', False)][: 2 * hasattr(os, 'fork')], ('spawn', True)

@@ -10,12 +10,15 @@ import helpers
 import mujoco
 import pytest
 
+from trl_suite.util import notices
+
 
 def pytest_configure():
     if hasattr(libc := ctypes.CDLL(None), 'mallopt'):  # glibc
         # Large arrays are returned to the system when they are released, and threads share a heap.
         libc.mallopt(-3, 1 << 17)  # M_MMAP_THRESHOLD, which would rise to 32 MB by itself
         libc.mallopt(-8, 1)  # M_ARENA_MAX
+    notices.listeners.clear()  # tests compare what is written to stderr
     mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)  # meshes of foreign files, 0.2 GB
     # Background jobs of shell scripts ignore SIGINT, and so would the processes that tests start.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -53,7 +56,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    # A file at a time: workers that run parts of one file compile the same functions at once, and
+    # A file at a time: workers that run parts of one file wait for each other to compile, and
     # each of them keeps the environments and the code of all files in memory.
     from xdist.scheduler import LoadFileScheduling
 

@@ -61,6 +61,12 @@ def made(*parts, seed=0, flat=False, **options):
     return environment
 
 
+def besides_notices(told):
+    """Returns what a process wrote to stderr, except that it compiled functions."""
+    lines = told.splitlines(keepends=True)
+    return ''.join(line for line in lines if not line.startswith('trl_suite: '))
+
+
 def let_go():
     """Forgets the environments of `made`, and returns the memory of all that are released.
 

@@ -17,7 +17,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer
 from dm_control import mujoco as dm_mujoco
-from helpers import FolderTest
+from helpers import FolderTest, besides_notices
 
 from trl_suite import rendering, suite
 from trl_suite.rendering import cameras, drawing, overlays
@@ -641,10 +641,12 @@ def same(*pictures):
 def run_headless(program, variables):
     gl = ('DISPLAY', 'WAYLAND_DISPLAY', 'MUJOCO_GL', 'PYOPENGL_PLATFORM')
     rest = {name: value for name, value in os.environ.items() if name not in gl}
-    return subprocess.run(
+    done = subprocess.run(
         [sys.executable, '-W', 'ignore', '-c', program], capture_output=True, text=True,
         env={**rest, **variables}, timeout=60, check=False,
     )  # fmt: skip
+    done.stderr = besides_notices(done.stderr)
+    return done
 
 
 class ThreadTest(parameterized.TestCase):

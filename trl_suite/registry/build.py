@@ -16,7 +16,7 @@ from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.tasks import actuated, composed, disturbances
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
-from trl_suite.util import errors
+from trl_suite.util import errors, notices
 from trl_suite.util.options import Config, Option
 
 DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
@@ -75,6 +75,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
         parts that are incompatible.
     """
+    notices.compiling.about(spec.id)
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     disturbing = {name: merged.pop(name) for name in disturbances.OPTIONS if name in merged}

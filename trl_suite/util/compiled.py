@@ -23,9 +23,9 @@ Numba is imported and a function is compiled when it is first called. Its machin
 folder trl_suite/kernels/HASH in `$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends
 on all sources of the package, since compiled functions contain constants and code of other modules.
 Folders are used only if they belong to the user and nobody else can write there, because loading
-machine code runs it; files are checked as `trl_suite.util.machine_code` says. Without such a folder
-every process compiles the functions again, as it does with those that have free variables or no
-source file. With `NUMBA_DISABLE_JIT=1` the same code runs as Python, for debugging.
+machine code runs it; files are checked, and functions that another process compiles are waited for, as
+`trl_suite.util.machine_code` says. Without such a folder every process compiles the functions again,
+as it does with those that have free variables or no source file. With `NUMBA_DISABLE_JIT=1` the same code runs as Python, for debugging.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ from typing import Any
 
 from trl_suite.util import files, interrupts
 
-PATIENCE = 2.0  # s; if compiling takes longer, a message is printed if stderr is a terminal
 UNUSED = 30 * 86400.0  # s; machine code of other source versions unused for longer is removed
 
 
@@ -105,11 +104,11 @@ class Compiled:
             return numba.njit(self._native(), _nrt=True, **options)
         options['_nrt'] = False
         dispatcher = numba.njit(self.function, **options)
-        folder, code = cache_folder(), self.function.__code__
-        if folder is not None and not code.co_freevars and os.path.isfile(code.co_filename):
+        code = self.function.__code__
+        if not code.co_freevars and os.path.isfile(code.co_filename):
             from trl_suite.util.machine_code import Cache
 
-            dispatcher._cache = Cache(self.function, folder, entry)  # noqa: SLF001
+            Cache(self.function, cache_folder(), entry).attach(dispatcher)
         return dispatcher
 
     def __call__(self, *args: Any) -> Any:
@@ -163,25 +162,9 @@ def _numba() -> Any:
     """Imports Numba, postpones interrupts while it compiles, and registers the type of `Compiled`."""
     with interrupts.postponed():
         import numba
-        from numba.core import event
         from numba.extending import typeof_impl
 
     interrupts.postpone_while_compiling()
-    announcer = _Announcer()
-
-    def is_own(event: Any) -> bool:  # or else it is of another user of Numba in this process
-        return event.data['dispatcher'].py_func.__module__.startswith('trl_suite.')
-
-    class Listener(event.Listener):
-        def on_start(self, event: Any) -> None:
-            if is_own(event):
-                announcer.begin()
-
-        def on_end(self, event: Any) -> None:
-            if is_own(event):
-                announcer.end()
-
-    event.register('numba:compile', Listener())  # none for code that is loaded from the cache
 
     @typeof_impl.register(Compiled)
     def type_of(value: Compiled, _: Any) -> Any:
@@ -271,39 +254,3 @@ def _forget(folder: pathlib.Path) -> None:
                 for file in path.glob('*.nbc'):
                     file.unlink()
                 path.rmdir()
-
-
-class _Announcer:
-    """Prints a message, once per process, if compiling takes long and stderr is a terminal."""
-
-    def __init__(self) -> None:
-        self._spent, self._begun, self._depth, self._told = 0.0, 0.0, 0, False
-        self._timer: threading.Timer | None = None
-
-    def begin(self) -> None:
-        """A function is about to be compiled; calls may be nested."""
-        self._depth += 1
-        if self._depth > 1 or self._told:
-            return
-        self._begun = time.monotonic()
-        self._timer = threading.Timer(max(PATIENCE - self._spent, 0.0), self._tell)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def end(self) -> None:
-        """The function is compiled; its time is added to that of earlier ones."""
-        self._depth = max(self._depth - 1, 0)  # an interrupt may have come before `begin` counted
-        if self._depth == 0 and self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-            self._spent += time.monotonic() - self._begun
-
-    def _tell(self) -> None:
-        self._told = True
-        if sys.stderr.isatty():
-            print(
-                'trl_suite: compiling for this machine, once; the first steps of each kind of '
-                'environment take some seconds',
-                file=sys.stderr,
-                flush=True,
-            )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import FrameType
 from typing import Any
 
@@ -25,19 +25,23 @@ def postpone_while_compiling() -> None:
     """
     from numba.core import event
 
-    postponed = _Postponed()
-
     class Listener(event.Listener):
         def on_start(self, event: Any) -> None:
             if threading.current_thread() is threading.main_thread():
-                postponed.enter()
+                _compiling.enter()
 
         def on_end(self, event: Any) -> None:
             if threading.current_thread() is threading.main_thread():
-                postponed.leave()
+                _compiling.leave()
 
     for kind in ('numba:compile', 'numba:run_pass'):  # the events are nested
         event.register(kind, Listener())
+
+
+def deliver() -> None:
+    """Calls the handlers of signals that were postponed while Numba compiles; between two passes."""
+    if threading.current_thread() is threading.main_thread():
+        _compiling.deliver()
 
 
 @contextlib.contextmanager
@@ -75,12 +79,21 @@ class _Postponed:
         self._depth = max(self._depth - 1, 0)  # an interrupt may have come before `enter` counted
         handlers = dict(self._handlers)
         if self._depth == 0:
-            for number, handler in self._handlers.items():
+            for number, handler in handlers.items():
                 signal.signal(number, handler)
             self._handlers.clear()
+        self._call(handlers)
+
+    def deliver(self) -> None:
+        self._call(self._handlers)
+
+    def _call(self, handlers: Mapping[int, Any]) -> None:
         while self._received:
             number, frame = self._received.popitem()
             handlers[number](number, frame)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self._received[number] = frame
+
+
+_compiling = _Postponed()

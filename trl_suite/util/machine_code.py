@@ -4,6 +4,11 @@ A file holds the code of one function for one signature: the SHA-256 of what fol
 name is a hash of all that the code depends on, apart from the sources of the package, on which the
 name of the folder depends. What is missing, damaged, or may be written by others is compiled again.
 
+Two processes that need the same code at the same time do not both compile it: one holds a lock, which
+the operating system releases when the process ends in any way, and the other waits. A function is compiled
+while its callers are, and calls are not recursive, so that processes cannot wait for each other in
+a circle. There are no locks on Windows, and none on file systems without them.
+
 Numba's own files have no checksum, and two processes that compile a function for two signatures
 can write two entries of its index for one file.
 """
@@ -18,29 +23,35 @@ import pathlib
 import pickle
 import stat
 import sys
+import time
 import warnings
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, BinaryIO, cast
 
 import numba
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
-from trl_suite.util import files, interrupts
+from trl_suite.util import files, interrupts, notices
 
+limit = 120.0  # s; a process that waits longer for a function compiles it, and waits for no other
+_TICK = 0.05  # s between two looks at a lock
 _FLAGS = sum(getattr(os, name, 0) for name in ('O_NOFOLLOW', 'O_NONBLOCK', 'O_BINARY'))
 
 
 class Cache(NullCache):
     """What a dispatcher of Numba asks for the code of a function before it compiles it."""
 
-    def __init__(self, function: Callable[..., Any], folder: pathlib.Path, entry: bool) -> None:
+    def __init__(
+        self, function: Callable[..., Any], folder: pathlib.Path | None, entry: bool
+    ) -> None:
         """Prepares the cache of a function without free variables, which is in a file.
 
         Args:
           function: the Python function.
-          folder: where the files are.
+          folder: where the files are; None if code is not kept.
           entry: whether the code can be called from Python.
         """
         code, config = function.__code__, cast(Any, numba.config)
@@ -51,27 +62,32 @@ class Cache(NullCache):
             [*code.co_positions()],
         )  # fmt: skip
 
-    def _path(self, signature: Any, codegen: Any) -> pathlib.Path:
+    def attach(self, dispatcher: Any) -> None:
+        """Makes a dispatcher use this cache."""
+        dispatcher._cache = self  # noqa: SLF001
+        dispatcher.compile = functools.partial(_loaded_or_compiled, dispatcher.compile)
+
+    def _path(self, signature: Any, codegen: Any) -> pathlib.Path | None:
+        if self._folder is None:
+            return None
         key = repr((self._key, str(signature), codegen.magic_tuple()))
         return self._folder / f'{hashlib.sha256(key.encode()).hexdigest()[:32]}.nbc'
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """Returns the code for a signature, or None."""
+        """Returns the code for a signature, or None, after which Numba compiles it."""
         target_context.refresh()
-        with interrupts.postponed():
-            try:
-                known, code = pickle.loads(_read(self._path(sig, target_context.codegen())))
-                if known != sig:  # types of the same names
-                    return None
-                return CompileResult._rebuild(target_context, *code)  # noqa: SLF001
-            except Exception:  # no such file, a damaged one, or one with types that are gone
-                return None
+        path = self._path(sig, target_context.codegen())
+        found = _load(path, sig, target_context)
+        if found is None:
+            _begin(path)
+            found = _load(path, sig, target_context)  # another process may have compiled it
+        return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Writes the code for a signature; if that fails, a warning is issued once."""
-        if cres.library.has_dynamic_globals:  # addresses in this process
-            return
         path = self._path(sig, cres.codegen)
+        if path is None or cres.library.has_dynamic_globals:  # addresses in this process
+            return
         with interrupts.postponed():
             content = dumps((sig, cres._reduce()))  # noqa: SLF001
             try:
@@ -81,7 +97,87 @@ class Cache(NullCache):
             except OSError as error:
                 # On Windows a file that another process reads cannot be replaced.
                 if os.name != 'nt' or error.errno != errno.EACCES:
-                    _warn(self._folder, error.strerror)
+                    _warn(path.parent, error.strerror)
+
+
+def _load(path: pathlib.Path | None, signature: Any, target_context: Any) -> CompileResult | None:
+    if path is None:
+        return None
+    with interrupts.postponed():
+        try:
+            known, code = pickle.loads(_read(path))
+            if known != signature:  # types of the same names
+                return None
+            return CompileResult._rebuild(target_context, *code)  # noqa: SLF001
+        except Exception:  # no such file, a damaged one, or one with types that are gone
+            return None
+
+
+# Functions that are compiled, or waited for: each is called by the one before it.
+_pending: list[pathlib.Path | None] = []
+
+
+def _loaded_or_compiled(compile_: Callable[[Any], Any], signature: Any) -> Any:
+    """Calls the method `compile` of a dispatcher, and ends what it has begun."""
+    with global_compiler_lock:  # only one thread has pending functions
+        before = len(_pending)
+        try:
+            return compile_(signature)
+        finally:
+            while len(_pending) > before:
+                _end()
+
+
+def _begin(path: pathlib.Path | None) -> None:
+    _pending.append(path)
+    if len(_pending) == 1:
+        notices.compiling.begin()
+    if path is not None:
+        _wait(path)
+
+
+def _end() -> None:
+    path = _pending.pop()
+    if path is not None:
+        _change_lock(path, 'LOCK_UN')
+    if not _pending:
+        notices.compiling.end()
+
+
+def _wait(path: pathlib.Path) -> None:
+    """Locks a function, as soon as no other process has the lock."""
+    global limit
+    until = time.monotonic() + limit
+    while not _change_lock(path, 'LOCK_EX', 'LOCK_NB'):
+        if time.monotonic() >= until:
+            limit = 0.0
+            return
+        with notices.compiling.waiting():
+            time.sleep(_TICK)
+        interrupts.deliver()
+
+
+def _change_lock(path: pathlib.Path, *operation: str) -> bool:
+    """Locks or unlocks a function; returns whether no other process has the lock, as far as is known."""
+    if files.fcntl is None:
+        return True
+    try:
+        file = _lock_file(path.parent)
+    except OSError:
+        return True
+    flags = sum(getattr(files.fcntl, name) for name in operation)
+    place = int(hashlib.sha256(str(path).encode()).hexdigest()[:10], 16)
+    try:
+        files.fcntl.lockf(file, flags, 1, place)  # a byte stands for the function
+    except OSError as error:  # others than these: the file system has no locks
+        return error.errno not in (errno.EAGAIN, errno.EACCES)
+    return True
+
+
+@functools.cache
+def _lock_file(folder: pathlib.Path) -> BinaryIO:
+    # Closing it would release the locks. Forked processes do not inherit them.
+    return open(folder.parent / 'lock', 'ab')
 
 
 @functools.cache

@@ -30,7 +30,7 @@ from trl_suite.environments import named_policies
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene, web_server
-from trl_suite.util import program
+from trl_suite.util import notices, program
 from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Loaded, Policy, Session
 
@@ -111,6 +111,7 @@ class Browser:
     def run(self) -> None:
         """Runs the simulation until `stop` or an interrupt, which is raised; closes the viewer."""
         due = plotted = 0.0
+        notices.listeners.append(self._panel.notice)
         try:
             while not self._stopped.is_set():
                 self._serve()
@@ -133,6 +134,7 @@ class Browser:
                     plotted = now
                     self._panel.plot(self.session)
         finally:
+            notices.listeners.remove(self._panel.notice)
             web_server.stop_server(self._server)
 
     def start(self) -> Browser:

@@ -189,10 +189,14 @@ class Panel:
         self._status.content = f'<div style="padding: 0.5em 1em; font-size: 0.85em">{cells}</div>'
         self._play.label = 'Pause' if playing else 'Play'
 
-    def tell(self, message: str) -> None:
-        """Shows an error message in all browsers."""
+    def tell(self, message: str, title: str = 'Error', color: str = 'red') -> None:
+        """Shows a message in all browsers."""
         for client in self._server.get_clients().values():
-            client.add_notification('Error', message, color='red', auto_close_seconds=NOTICE)
+            client.add_notification(title, message, color=color, auto_close_seconds=NOTICE)
+
+    def notice(self, message: str) -> None:
+        """Shows what the viewer waits for."""
+        self.tell(message, 'Please wait', 'blue')
 
 
 def slider_range(name: str, value: float) -> tuple[float, float]:
