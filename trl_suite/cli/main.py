@@ -11,6 +11,7 @@
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite try robot.urdf --spatial
     trl-suite doctor
+    trl-suite compile --all
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
     trl-suite gallery --filter Dog2D_Gaps
     trl-suite sequences run plaid_biped --learner my_module:MyLearner --output result.json
@@ -279,6 +280,10 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )
 
     add('doctor', 'check the installation; print problems and remedies')
+
+    command = add('compile', 'compile environments, so that their first steps need not wait')
+    command.add_argument('ids', metavar='ID', nargs='*', help="ids, or 'domain/task'")
+    command.add_argument('--all', action='store_true', help='all environments of the catalogue')
 
     command = add('bench', 'measure the speed of this machine against raw MuJoCo')
     command.add_argument(

@@ -1,0 +1,38 @@
+"""`trl-suite compile`: compiles environments, for images of containers and for clusters."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+import tqdm
+
+from trl_suite import suite
+from trl_suite.environments.environment import Environment
+from trl_suite.environments.vector import VectorEnvironment
+from trl_suite.registry import catalogue
+from trl_suite.util import compiled
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Takes a step in each environment, alone and in a vector; what that needs is compiled and kept."""
+    if arguments.all == bool(arguments.ids):
+        raise ValueError('expected ids, or --all (see trl-suite compile --help)')
+    specs = catalogue.SPECS if arguments.all else [suite.find(id_) for id_ in arguments.ids]
+    folder, begin = compiled.cache_folder(), time.perf_counter()
+    if folder is None:
+        raise RuntimeError('there is no folder in which compiled code can be kept')
+    for spec in (bar := tqdm.tqdm(specs, unit='environment', disable=None)):
+        bar.set_description(spec.id)
+        made: tuple[Environment | VectorEnvironment, ...] = (
+            suite.build_environment(spec, {'random': 0}, {}), VectorEnvironment(spec, 2, 1, seed=0)
+        )  # fmt: skip
+        for environment, shape in zip(made, ((), (2,)), strict=True):
+            environment.reset()
+            environment.step(np.zeros((*shape, len(environment.action_map))))
+            world = environment.task.world
+            world.forward(world.all_ids)  # as when a ground moves, which few steps do
+            environment.close()
+    count = f'{len(specs)} environment{"" if len(specs) == 1 else "s"}'
+    print(f'{count} compiled in {time.perf_counter() - begin:.0f} s; the code is in {folder}')
