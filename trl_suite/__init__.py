@@ -14,7 +14,7 @@ from typing import Any
 
 if (
     sys.platform == 'linux'
-    and 'MUJOCO_GL' not in os.environ
+    and not os.environ.get('MUJOCO_GL')
     and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
     and ctypes.util.find_library('EGL')  # without this library, importing dm_control would fail
 ):
