@@ -207,7 +207,7 @@ class ActionMapTest(parameterized.TestCase):
         spec = dataclasses.replace(
             characters.CHARACTERS['biped2d'],
             name='mine',
-            path=str(resources.directory('xml') / 'biped2d.xml'),
+            xml=(resources.directory('xml') / 'biped2d.xml').read_text(),
         )
         with self.assertRaisesRegex(ValueError, "'mine' has no muscles.*biped2d.*dog.*raptor"):
             actuation.add(characters.make(spec), 'muscle', TIMESTEP)

@@ -637,7 +637,7 @@ class BuildTest(parameterized.TestCase):
     def test_a_users_own_character(self):
         spec = dataclasses.replace(
             characters.CHARACTERS['biped2d'], name='mine', clip=None, fall_links=('root', 'left_knee'),
-            path=str(resources.directory('xml') / 'biped2d.xml'),
+            xml=(resources.directory('xml') / 'biped2d.xml').read_text(),
         )  # fmt: skip
         with self.assertRaisesRegex(ValueError, 'clip'):
             suite.build(spec)
