@@ -238,9 +238,9 @@ class VectorEnvironment:
                 each[resting] = 0
         self.at_limit = truncated = np.zeros(self.num_envs, bool)
         if self.step_limit is not None:
-            truncated[asked] = steps[asked] >= self.step_limit
+            truncated[env_ids] = steps[env_ids] >= self.step_limit
         if self.time_limit < np.inf:
-            truncated[asked] |= world.time[asked] >= self.time_limit - arguments.TIME_ERROR
+            truncated[env_ids] |= world.time[env_ids] >= self.time_limit - arguments.TIME_ERROR
         truncated = truncated & ~terminated
         ended[asked] = terminated[asked] | truncated[asked]
         if self.autoreset == 'same_step':
