@@ -575,7 +575,7 @@ class RolloutTest(CommandTest):
         ("suffix ''; expected .npz", GAPS, '--trajectory', 'a'),
         ("the folder 'no' does not exist", GAPS, '--trajectory', 'no/a.npz'),
         ("unknown camera 'sid'; did you mean 'side'", GAPS, '--video', 'a.mp4', '--camera', 'sid'),
-        ('width is 4000; expected 1 to 1920', GAPS, '--video', 'a.mp4', '--size', '4000x100'),
+        ('width is 4000; expected a whole number from 1 to 1920', GAPS, '--video', 'a.mp4', '--size', '4000x100'),
         ('h264 needs even', GAPS, '--video', 'a.mp4', '--size', '161x121'),
         ("'big' is not a size such as 640x480", GAPS, '--size', 'big'),
         ("'0' is not a positive integer", GAPS, '--steps', '0'),

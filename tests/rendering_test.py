@@ -4,6 +4,7 @@ import contextlib
 import io
 import itertools
 import os
+import pathlib
 import signal
 import subprocess
 import sys
@@ -435,7 +436,7 @@ except OSError as error:
 
     def test_a_folder_that_cannot_be_written(self):
         with (
-            mock.patch.object(os, 'access', lambda path, mode: False),
+            mock.patch.object(pathlib.Path, 'touch', side_effect=PermissionError),
             self.assertRaisesRegex(PermissionError, "a.gif: the folder '.*' cannot be written"),
         ):
             rendering.video(numbered(2), self.folder / 'a.gif')

@@ -310,6 +310,20 @@ class SignatureTest(parameterized.TestCase):
             self.assertEqual(pickle.dumps(environment.get_state()), before)
             environment.set_state(pickle.loads(before))
 
+    def test_functions_with_names_that_change(self):
+        """What a function of a user collects, or refers to later, is no part of the signature."""
+        calls = []
+
+        def bonus(task):
+            calls.append(task is environment.task)
+            return np.zeros(task.world.n)
+
+        environment = self.build(rewards={'bonus': (1.0, bonus)})
+        environment.reset()
+        environment.step(np.zeros(6))
+        self.assertNotEmpty(calls)
+        self.build(rewards={'bonus': (1.0, bonus)}).set_state(environment.get_state())
+
     def build(self, character='biped2d', clip='biped2d_walk', terrain='flat', **options):
         return suite.build(
             character, 'position', terrain, clip=clip, task_kwargs={'random': 1, **options}

@@ -12,14 +12,19 @@ from typing import Any
 
 import numpy as np
 
+_CONSTANTS = (
+    bool, int, float, str, bytes, tuple, np.generic, np.ndarray, type, types.FunctionType,
+    types.MethodType, functools.partial, pathlib.PurePath,
+)  # fmt: skip
+
 
 def digest(value: Any, without: Collection[str] = ()) -> str:
     """Returns the first 16 hexadecimal digits of the SHA-256 of a value.
 
     Equal values have equal digests, in every process with the same version of Python. What counts
     are types, shapes and contents of arrays; entries of mappings and sequences, in order; fields of
-    dataclasses; name, bytecode, defaults and closure of functions, but not the globals that they
-    use; and of any other object only its class.
+    dataclasses; name, bytecode, defaults and closure of functions, but neither the globals that they
+    use nor what may change in their closure, such as lists; and of any other object only its class.
 
     Args:
       value: the value.
@@ -75,8 +80,7 @@ def _add(value: Any, parts: list[bytes], without: Collection[str], inside: tuple
     elif isinstance(value, types.FunctionType):
         add('function', value.__module__, value.__qualname__)
         if value not in inside:
-            cells = [cell.cell_contents for cell in value.__closure__ or ()]
-            content = value.__code__, value.__defaults__, value.__kwdefaults__, cells
+            content = value.__code__, value.__defaults__, value.__kwdefaults__, _closure(value)
             add('content', *content, inside=(*inside, value))
     elif hasattr(value, 'py_func'):  # compiled by Numba
         add('compiled', value.py_func)
@@ -84,3 +88,16 @@ def _add(value: Any, parts: list[bytes], without: Collection[str], inside: tuple
         add('path', str(value))
     else:
         add('object', type(value))
+
+
+def _closure(function: types.FunctionType) -> list[Any]:
+    """Returns the values in the closure of a function; None for what may change, and later values."""
+    values = []
+    for cell in function.__closure__ or ():
+        try:
+            value = cell.cell_contents
+        except ValueError:  # a name that has no value yet
+            value = None
+        constant = isinstance(value, _CONSTANTS) or dataclasses.is_dataclass(value)
+        values.append(value if constant else None)
+    return values
