@@ -824,6 +824,8 @@ def extreme_states(task):
     yield world.qpos, turn, (0, 1, 0, 0) if spatial else np.pi  # upside down
     for value in VALUES:
         yield world.qpos, figure.pose_qpos[:1], value  # x
+        yield world.qpos, figure.pose_qpos[1:2], value  # y, in the plane z
+        yield world.qpos, figure.pose_qpos[:2], value
         yield world.qpos, turn, value
         yield world.qpos, figure.pose_qpos[position:], value
         yield world.qvel, figure.pose_dof[:1], value
