@@ -379,6 +379,7 @@ class UploadTest(ViewerTest):
         first, again, second = (policy(time_step) for policy in found[1:])
         np.testing.assert_array_equal(first, again)
         self.assertGreater(np.abs(second - first).max(), 0.1)
+        self.assertTrue(client.answered())  # the panel has its new controls
         loaded = viewer._loaded
         client.set('Preset', 'slopes_mixed')
         self.assertTrue(waited_for(lambda: viewer._loaded.environment is not loaded.environment))
