@@ -1,9 +1,9 @@
-"""What a viser server accepts from browsers. By itself it obeys everyone who can connect.
+"""Access control for a viser server, and validation of the messages that it receives.
 
-Any web page may send requests and open websockets to an address of this machine, and so may its other
-users. All addresses of a guarded server therefore begin with a token that only its user is told. Of
-the messages, only those that the panel needs reach viser, with values that its controls can have:
-viser would set any attribute of a control, and open a tunnel to the internet.
+Any web page and any user of this machine can connect to a local port. The paths of a guarded server
+begin with a random token, which is part of the printed address; requests without it are refused.
+Messages are validated: only the types that the panel uses are accepted, with values that its
+controls can have. Viser itself would set any attribute of a control, and open a public tunnel.
 """
 
 from __future__ import annotations
