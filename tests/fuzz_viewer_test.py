@@ -175,6 +175,7 @@ class ViewerTest(parameterized.TestCase):
         self.enterContext(quiet())
         self.viewer = browser.Browser(FLAT, 'zero', port=0)
         self.tell = self.enterContext(mock.patch.object(self.viewer._panel, 'tell'))
+        self.enterContext(mock.patch.object(self.viewer._panel, 'notice'))  # of compiling
         self.viewer.start()
         self.addCleanup(self.viewer.stop)
 
