@@ -811,7 +811,9 @@ class CompileTest(CommandTest):
                     actions = draw.uniform(-1, 1, (3, len(many.action_map)))
                     environment.step(actions[0]), many.step(actions)
         """
-        variables = {**os.environ, 'NUMBA_CACHE_DIR': str(self.folder), 'MUJOCO_GL': 'disable'}
+        # Not in this folder itself: Python would take the folder `trl_suite` in it for the package.
+        cache = self.folder / 'cache'
+        variables = {**os.environ, 'NUMBA_CACHE_DIR': str(cache), 'MUJOCO_GL': 'disable'}
         for more, nothing in (('', False), (steps, True)):
             out = subprocess.run(
                 [sys.executable, '-c', textwrap.dedent(begin + more + end)], env=variables, text=True,
