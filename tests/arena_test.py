@@ -206,7 +206,7 @@ class QueryTest(parameterized.TestCase):
         ground = SpatialGround(source, 4)
         for centre in (0.0, 9.0, -40.0, 500.0):
             ground.follow(centre)
-            xs = np.random.default_rng(1).uniform(centre - 3, centre + 12, (1, 400))
+            xs = np.random.default_rng(1).uniform(centre - 14.9, centre + 14.9, (1, 400))
             np.testing.assert_allclose(ground.arena.height(xs), ground.strip.height(xs), atol=1e-10)
             np.testing.assert_allclose(ground.arena.slope(xs), ground.strip.slope(xs), atol=1e-9)
 
@@ -220,13 +220,12 @@ class QueryTest(parameterized.TestCase):
         ground = SpatialGround('slopes_mixed_humanoid', 4)
         ground.follow(9.0)
         arrays = ground.arena.ground
-        xs = np.linspace(-35, 45, 999)[None]
+        xs = np.linspace(-40, 60, 999)[None]
         self.assertFalse(arrays.is_wide[0])
         heights = ground.arena.height(xs)
         ground.arena.look_far(xs, heights)
         self.assertTrue(arrays.is_wide[0])
-        near = xs >= 12 - 6 - 24  # the window begins 6 m before 12 m
-        np.testing.assert_array_equal(heights[near], ground.strip.height(xs[near]))
+        np.testing.assert_array_equal(heights, ground.strip.height(xs))
         far = [planar_ground.far_height(0, x, arrays) for x in xs[0]]
         np.testing.assert_array_equal(far, heights[0])
         self.assertEqual(planar_ground.far_height(0, -1e300, arrays), arrays.wide[0, 0])
@@ -237,13 +236,13 @@ class QueryTest(parameterized.TestCase):
     def test_functions_of_one_simulation(self):
         ground = SpatialGround('slopes_humanoid', 4)
         arrays = ground.arena.ground
-        for x in (-5.9, 0.0, 0.3, 3.0, 17.9):
+        for x in (-17.9, -5.9, 0.0, 0.3, 3.0, 17.9):
             at = np.array([[x]])
             self.assertEqual(planar_ground.height(0, x, arrays), ground.arena.height(at)[0, 0])
             self.assertEqual(planar_ground.slope(0, x, arrays), ground.arena.slope(at)[0, 0])
             self.assertFalse(planar_ground.is_outside(0, x, arrays))
             self.assertEqual(planar_ground.has_left(0, x, arrays), abs(x) > 3.1)
-        for x in (-6.1, 18.1, 1e300, -1e300):
+        for x in (-18.1, 18.1, 1e300, -1e300):
             self.assertTrue(planar_ground.is_outside(0, x, arrays))
             self.assertTrue(np.isfinite(planar_ground.height(0, x, arrays)))
         self.assertTrue(np.isnan(planar_ground.height(0, np.nan, arrays)))

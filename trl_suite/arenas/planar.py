@@ -15,7 +15,7 @@ from trl_suite.engine import World, bounds
 from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.generators import BORDER
-from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.terrain.planar.windows import BEFORE, PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes around its centre
@@ -27,7 +27,8 @@ EDGE = 0.82  # brightness of the edges of the ground, and so of its sides
 COARSEST = 0.1  # m; largest tolerance for merging pieces if the pool is too small
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
-_WINDOW = _BEHIND + _AHEAD + 1  # vertices
+_WINDOW = _BEHIND + _AHEAD + 1  # vertices that have boxes
+_VERTICES = BEFORE + _WINDOW
 _CELLS_PER_METRE = 1 / SPACING
 _REACH = 0.5 * ADVANCE + SPACING  # m; distance from the centre beyond which a window is moved
 
@@ -90,7 +91,7 @@ class PlanarArena(composer.Arena):
             for model in world.models
         ]
         self.grounds: list[PlanarGround | None] = [None] * world.n
-        self.ground = planar_ground.empty(world.n, _WINDOW, _REACH)
+        self.ground = planar_ground.empty(world.n, _VERTICES, _REACH)
         self._ground = packed(self.ground)
         self._numbers = np.arange(world.n)
 
@@ -137,9 +138,9 @@ class PlanarArena(composer.Arena):
         """
         u = x * _CELLS_PER_METRE
         u -= self.ground.start[:, None]
-        if u.min() >= 0 and u.max() < _WINDOW - 1:
+        if u.min() >= -BEFORE and u.max() < _WINDOW - 1:
             return
-        far = np.flatnonzero((u.min(1) < 0) | (u.max(1) >= _WINDOW - 1))
+        far = np.flatnonzero((u.min(1) < -BEFORE) | (u.max(1) >= _WINDOW - 1))
         for env_id in far.tolist():
             self.widen(env_id)
         heights[far] = self._ask(_far_heights, x[far], far)
@@ -149,8 +150,8 @@ class PlanarArena(composer.Arena):
         strip, ground = self.grounds[env_id], self.ground
         if strip is None or ground.is_wide[env_id]:
             return
-        start = int(ground.start[env_id]) - _WINDOW
-        ground.wide[env_id] = strip.window(start, 3 * _WINDOW + 1)[0]
+        start = int(ground.start[env_id]) - BEFORE - _VERTICES
+        ground.wide[env_id] = strip.window(start, 3 * _VERTICES + 1)[0]
         ground.is_wide[env_id] = True
 
     def slope(self, x: np.ndarray, env_ids: slice | np.ndarray = slice(None)) -> np.ndarray:
@@ -186,11 +187,12 @@ class PlanarArena(composer.Arena):
         strip = self.grounds[env_id]
         assert strip is not None
         start = centre - _BEHIND
-        heights, vertical = strip.window(start, _WINDOW)
+        heights, vertical = strip.window(start - BEFORE, _VERTICES)
         if is_laid(env_id, centre, heights, vertical, self._ground):
             return  # the window has equal vertices, as on flat ground: boxes need not move
         tolerance = boxes.TOLERANCE
-        pieces = boxes.cut(start, heights, vertical, tolerance)
+        surface = heights[BEFORE:], vertical[BEFORE:]
+        pieces = boxes.cut(start, *surface, tolerance)
         while pieces.number > len(self.boxes):  # a coarser surface is better than one with holes
             tolerance *= 2
             if tolerance > COARSEST:
@@ -199,7 +201,7 @@ class PlanarArena(composer.Arena):
                     f'{BEHIND + AHEAD:g} m; expected at most {len(self.boxes)}, as estimated from {PROBES} '
                     'random windows; distribute its features more evenly'
                 )
-            pieces = boxes.cut(start, heights, vertical, tolerance)
+            pieces = boxes.cut(start, *surface, tolerance)
         lay(
             env_id, centre, heights, vertical, pieces.number, pieces.level, pieces.ends, pieces.edges,
             boxes.angles(pieces), self._ground, self._pools[env_id],
@@ -241,7 +243,7 @@ def lay(
         ground.heights[i, k], ground.vertical[i, k] = heights[k], vertical[k]
         if k > 0:
             ground.rises[i, k - 1] = heights[k] - heights[k - 1]
-    boxes.pose(count, level, vertical, ends, edges, angle, pool.boxes)
+    boxes.pose(count, level, vertical[BEFORE:], ends, edges, angle, pool.boxes)
     position, half_size = pool.boxes.position, pool.boxes.half_size
     for k in range(count, len(position)):  # unused boxes
         position[k, 0], position[k, 1], position[k, 2] = (centre + _AHEAD) * SPACING, 0.0, PARKED

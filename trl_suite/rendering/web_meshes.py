@@ -11,7 +11,7 @@ import trimesh
 
 from trl_suite.arenas.boxes import HALF_WIDTH
 from trl_suite.terrain import SPACING
-from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.terrain.planar.windows import BEFORE, PlanarWindows
 
 SECTIONS = 24  # number of faces around a cylinder or cone
 TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
@@ -94,7 +94,7 @@ def ground_meshes(
 
 def planar_mesh(ground: PlanarWindows) -> trimesh.Trimesh:
     """Returns the window of a planar ground: its profile, as wide as the boxes of the physics."""
-    heights, vertical = ground.heights[0], ground.vertical[0]
+    heights, vertical = ground.heights[0, BEFORE:], ground.vertical[0, BEFORE:]
     x = (ground.start[0] + np.arange(len(heights))) * SPACING
     # Vertical faces stand in the middle of their cells.
     face = np.flatnonzero(vertical[1:])

@@ -10,6 +10,7 @@ from trl_suite.terrain.planar.generators import BORDER, SPACING
 from trl_suite.util.compiled import compiled_inline, nearest_index
 
 FARTHEST = 1e4  # m from its window; a character that is suddenly farther away is lost
+BEFORE = 480  # vertices of a window before `start`, so that characters can look backwards, too
 
 _CELLS_PER_METRE = 1 / SPACING
 
@@ -18,7 +19,8 @@ class PlanarWindows(NamedTuple):
     """Windows of W vertices, SPACING apart, of n grounds. The arrays are never replaced.
 
     Attributes:
-      start: number of the first vertex of a window, (n,); NaN before the first episode.
+      start: number of the vertex at which the boxes of a window begin, `BEFORE` vertices after the
+        first one, (n,); NaN before the first episode.
       centre: middle of the range of character positions for which a window is valid, (n,) m.
       reach: distance of the character from the centre beyond which a window is refilled, m.
       heights: heights of the vertices, (n, W) m.
@@ -61,7 +63,7 @@ def height(i: int, x: float, ground: PlanarWindows) -> float:
     """
     u = x * _CELLS_PER_METRE - ground.start[i]
     whole = np.floor(u)
-    cell = nearest_index(whole, ground.heights.shape[1])
+    cell = nearest_index(whole + BEFORE, ground.heights.shape[1])
     return (u - whole) * ground.rises[i, cell] + ground.heights[i, cell]
 
 
@@ -69,13 +71,13 @@ def height(i: int, x: float, ground: PlanarWindows) -> float:
 def slope(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the slope dh/dx of the ground of simulation i at x, m."""
     whole = np.floor(x * _CELLS_PER_METRE - ground.start[i])
-    return ground.rises[i, nearest_index(whole, ground.heights.shape[1])] / SPACING
+    return ground.rises[i, nearest_index(whole + BEFORE, ground.heights.shape[1])] / SPACING
 
 
 @compiled_inline
 def is_outside(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether x, m, lies beyond the window of simulation i."""
-    u = x * _CELLS_PER_METRE - ground.start[i]
+    u = x * _CELLS_PER_METRE - ground.start[i] + BEFORE
     return u < 0.0 or u >= ground.heights.shape[1] - 1
 
 
@@ -89,7 +91,8 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
     """
     position = x / SPACING
     whole = np.floor(position)
-    first, last = ground.start[i] - ground.heights.shape[1], ground.wide.shape[1] - 1
+    first = ground.start[i] - BEFORE - ground.heights.shape[1]
+    last = ground.wide.shape[1] - 1
     if whole < first:
         return ground.wide[i, 0]
     if whole >= first + last:
