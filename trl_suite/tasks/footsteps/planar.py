@@ -16,7 +16,7 @@ import numpy as np
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import has_fallen, measure, must_wait
+from trl_suite.kinematics.planar import has_fallen, measure
 from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
@@ -218,32 +218,18 @@ def draw_plans(
 @compiled_loop
 def finish_steps(
     env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
-) -> int:
-    """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
-    waiting = 0
+) -> None:
+    """Finishes steps."""
     for i in env_ids:
-        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.measurement.waiting[i]:
-            waiting += 1
-        else:
-            finish_step(i, rules, plan, options)
-    return waiting
+        finish_step(i, rules, plan, options)
 
 
 @compiled_loop
 def observe_all(
     env_ids: np.ndarray, fresh: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
-) -> int:
-    """Writes observations; returns how many simulations are waiting for ground, see `must_wait`.
-
-    If `fresh`, episodes have just begun, and outcomes are reset.
-    """
-    waiting = 0
+) -> None:
+    """Writes observations; if `fresh`, episodes have just begun, and outcomes are reset."""
     for i in env_ids:
-        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.measurement.waiting[i]:
-            waiting += 1
-            continue
         measure(
             i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
         )
@@ -251,7 +237,6 @@ def observe_all(
         observe(i, rules, plan, options)
         if fresh:
             begin(i, rules.outcome)
-    return waiting
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -358,12 +343,10 @@ class PlanarFootsteps(PlanarImitation):
         draw_plans(env_ids, *self._packs)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if finish_steps(env_ids, *self._packs):
-            finish_steps(self._widened(env_ids), *self._packs)
+        finish_steps(env_ids, *self._packs)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if observe_all(env_ids, fresh, *self._packs):
-            observe_all(self._widened(env_ids), fresh, *self._packs)
+        observe_all(env_ids, fresh, *self._packs)
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places."""

@@ -304,19 +304,10 @@ class GaitTask(Task):
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])
-        if finish_steps(env_ids, self._pack):
-            finish_steps(self._widened(env_ids), self._pack)
+        finish_steps(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._observe(self.world.all_ids if env_ids is None else env_ids, False)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if observe_all(env_ids, fresh, self._pack):
-            observe_all(self._widened(env_ids), fresh, self._pack)
-
-    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
-        waiting = env_ids[self.rules.measurement.waiting[env_ids]]
-        for i in waiting.tolist():
-            self.arena.widen(i)
-        return waiting
+        observe_all(env_ids, fresh, self._pack)

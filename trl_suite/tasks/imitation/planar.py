@@ -278,22 +278,13 @@ class PlanarImitation(Task):
             self.figure.follow(env_ids[self._measurement.leaving[env_ids]])
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if finish_steps(env_ids, self._pack):
-            finish_steps(self._widened(env_ids), self._pack)
+        finish_steps(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._observe(self.world.all_ids if env_ids is None else env_ids, False)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if observe_all(env_ids, fresh, self._pack):
-            observe_all(self._widened(env_ids), fresh, self._pack)
-
-    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
-        waiting = env_ids[self._measurement.waiting[env_ids]]
-        for i in waiting.tolist():
-            self.arena.widen(i)
-        return waiting
+        observe_all(env_ids, fresh, self._pack)
 
     def clip_action(self, env_id: int) -> np.ndarray:
         """Returns the action that moves the joints along the clip, in open loop.

@@ -16,7 +16,6 @@ from trl_suite.kinematics.planar import (
     is_lost,
     leaves,
     measure,
-    must_wait,
 )
 from trl_suite.kinematics.planar_reference import ClipTable, feature
 from trl_suite.tasks.components import rewards
@@ -209,30 +208,16 @@ def apply_actions(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> int:
 
 
 @compiled_loop
-def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
-    """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
-    waiting = 0
+def finish_steps(env_ids: np.ndarray, rules: Rules) -> None:
+    """Finishes steps."""
     for i in env_ids:
-        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.measurement.waiting[i]:
-            waiting += 1
-        else:
-            finish_step(i, rules)
-    return waiting
+        finish_step(i, rules)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
-    """Writes observations; returns how many simulations are waiting for ground, see `must_wait`.
-
-    If `fresh`, episodes have just begun, and outcomes are reset.
-    """
-    waiting = 0
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> None:
+    """Writes observations; if `fresh`, episodes have just begun, and outcomes are reset."""
     for i in env_ids:
-        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.measurement.waiting[i]:
-            waiting += 1
-            continue
         measure(
             i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
         )
@@ -240,4 +225,3 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
         observe(i, rules)
         if fresh:
             begin(i, rules.outcome)
-    return waiting

@@ -16,7 +16,6 @@ from trl_suite.kinematics.planar import (
     PlanarState,
     has_fallen,
     leaves,
-    must_wait,
 )
 from trl_suite.kinematics.spatial import (
     SpatialBody,
@@ -116,9 +115,8 @@ def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> i
 
 
 @compiled_loop
-def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int:
-    """Finishes steps, or only observes; returns how many are waiting, see `must_wait`."""
-    waiting = 0
+def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> None:
+    """Finishes steps, or only observes."""
     for i in env_ids:
         outcome = rules.outcome
         if stepped:
@@ -130,14 +128,9 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
             if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)
                 continue
-        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.measurement.waiting[i]:
-            waiting += 1
-            continue
         look_planar(i, rules)
         if stepped:
             conclude(i, has_fallen(i, rules.body, rules.physics), outcome)
-    return waiting
 
 
 # In three dimensions.
@@ -178,8 +171,8 @@ def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) ->
 
 
 @compiled_loop
-def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> int:
-    """Finishes steps, or only observes; returns 0, since none has to wait for ground."""
+def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> None:
+    """Finishes steps, or only observes."""
     for i in env_ids:
         outcome = rules.outcome
         if stepped:
@@ -194,4 +187,3 @@ def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> i
         look_spatial(i, rules)
         if stepped:
             conclude(i, rules.measurement.fallen[i], outcome)
-    return 0

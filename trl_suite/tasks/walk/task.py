@@ -192,14 +192,14 @@ class Walk(Task):
                 *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'target_heading')),
                 figure.measurement, self.state, np.zeros(n, bool), self.outcome,
             )  # fmt: skip
-            self._leaving, self._waiting = rules.leaving, np.zeros(n, bool)
+            self._leaving = rules.leaving
             self._act, self._finish = act_spatial, finish_spatial
         else:
             measurement = figure.empty_measurement()
             rules = PlanarRules(  # type: ignore[call-arg]
                 *common, world.ctrl, measurement, self.state, self.outcome
             )
-            self._leaving, self._waiting = measurement.leaving, measurement.waiting
+            self._leaving = measurement.leaving
             self._act, self._finish = act_planar, finish_planar
         self._pack = packed(rules)
 
@@ -258,21 +258,11 @@ class Walk(Task):
                 self.figure.follow(leaving)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if self._finish(env_ids, True, self._pack):
-            self._finish(self._widened(env_ids), True, self._pack)
+        self._finish(env_ids, True, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
-        if self._finish(env_ids, False, self._pack):
-            self._finish(self._widened(env_ids), False, self._pack)
-
-    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
-        waiting = env_ids[self._waiting[env_ids]]
-        assert isinstance(self.arena, PlanarArena)
-        for i in waiting.tolist():
-            self.arena.widen(i)
-        return waiting
+        self._finish(env_ids, False, self._pack)
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the components of horizontal vectors (n, 2) along the target heading, (n,)."""
