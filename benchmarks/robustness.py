@@ -21,7 +21,6 @@ import tqdm
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
-from trl_suite.tasks.disturbances import sensors
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
 
@@ -70,7 +69,7 @@ DISTURBANCES: list[tuple[str, str, bool, list[tuple[str, dict[str, Any]]]]] = [
     ),
     (
         'noise', 'of the preset', False,
-        [(name, {'sensors': {'preset': name, 'bias': 0.0, 'delay': 0, 'terrain_dropout': sensors.PRESETS[name]['terrain_dropout'], 'noise': sensors.PRESETS[name]['noise']}}) for name in LEVELS],
+        [(name, {'sensors': {'preset': name, 'bias': 0.0, 'delay': 0}}) for name in LEVELS],
     ),
     ('bias of all blocks', '', False, _sensors('bias', 0.01, 0.03, 0.1)),
     ('delay of all blocks', 'steps', False, _sensors('delay', 1, 2, 4)),

@@ -16,7 +16,6 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from trl_suite.tasks.components import rewards
 from trl_suite.tasks.navigation import scripted
 from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
@@ -42,6 +41,11 @@ LOOKS = 33  # points on a straight line at which the cost is sampled
 BEYOND = 1.5  # assumed cost per m outside the map
 
 Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def wrap(angle: np.ndarray) -> np.ndarray:
+    """Returns angles in rad wrapped to [-pi, pi]."""
+    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 class Map:
@@ -180,10 +184,10 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
             free = apart(env_id, place) if moves else level(env_id, place)
             cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= 0)
             off[k] = map_.aim(cost, goal - place)
-            bend = rewards.wrap(np.arctan2(off[k, 1], off[k, 0]) - heading[k])
+            bend = wrap(np.arctan2(off[k, 1], off[k, 0]) - heading[k])
             careful = abs(bend) > BEND or free[map_.middle] < CLOSE
             length[k] = CAUTIOUS if careful else 1.0
-        way = rewards.wrap(np.arctan2(off[:, 1], off[:, 0]) - heading)
+        way = wrap(np.arctan2(off[:, 1], off[:, 0]) - heading)
         footsteps = scripted.steps(way, step_length * length, stance, step_length)
         return np.clip(action_map.action(footsteps), -1, 1)
 

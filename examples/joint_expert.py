@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from expert import planner
+from expert import planner, wrap
 
 from trl_suite import policies
 from trl_suite.motion import quaternion
-from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.footstep_plan import PLAN_SIZE
 from trl_suite.tasks.navigation.direct import DirectNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import CONTROLLER
@@ -83,7 +82,7 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
             ahead, left = quaternion.turned(away, -found.heading).T
             parts['plan'][everyone, slot], parts['plan'][everyone, slot + 1] = ahead, left
             parts['plan'][everyone, slot + 2] = landing[:, which, 2] - found.under
-        parts['plan'][:, -1] = rewards.wrap(heading - found.heading)
+        parts['plan'][:, -1] = wrap(heading - found.heading)
         action = controller(np.concatenate([parts[name] for name in observed], axis=1))
         angles = targets.action_offset + targets.action_scale * np.clip(action, -1, 1)
         own = task.action_map

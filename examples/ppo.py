@@ -37,7 +37,6 @@ from torch.optim import swa_utils
 
 from trl_suite import characters, evaluation, policies, suite
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.tasks.components import rewards
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
@@ -279,8 +278,7 @@ class Trainer:
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
             raise ValueError(f'{self.spec.id} has no left and right to mirror')
-        terms = getattr(self.environments.task, 'TERMS', rewards.IMITATION_TERMS)
-        self.largest = {name: weight for name, (weight, _) in terms.items()}
+        self.largest = {term.name: term.weight for term in self.environments.task.terms}
         self.random = np.random.default_rng(seed)
         outputs, blocks = len(self.environments.action_map), self.environments.blocks
         starts = [blocks[name].start for name in s.places]

@@ -7,7 +7,6 @@ from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_single
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
-from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.plans import StraightPlans
 from trl_suite.vector import VectorEnvironment
 
@@ -208,10 +207,9 @@ class RewardTest(parameterized.TestCase):
 
     def test_weights_and_scales(self):
         task = started()[0].task
-        self.assertIs(task.TERMS, rewards.STEP_TERMS)
-        self.assertEqual(list(task.TERMS), list(WEIGHTS))
-        for name, weight in WEIGHTS.items():
-            self.assertAlmostEqual(task.TERMS[name][0], weight, delta=1e-12)
+        self.assertEqual([term.name for term in task.terms], list(WEIGHTS))
+        for term in task.terms:
+            self.assertAlmostEqual(term.weight, WEIGHTS[term.name], delta=1e-12)
 
     @parameterized.parameters(0.02, 0.11, 0.24, 0.49999, 0.53, 0.7, 0.99999)
     def test_the_clip_has_full_reward(self, phase):

@@ -22,7 +22,7 @@ from helpers import (
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite, terrain
-from trl_suite.tasks.components import rewards
+from trl_suite.tasks import terms
 from trl_suite.tasks.components.plans import Plans, Pushes
 from trl_suite.vector import VectorEnvironment
 
@@ -382,16 +382,15 @@ class RewardTest(parameterized.TestCase):
 
     def test_weights_and_scales(self):
         task = started()[0].task
-        self.assertIs(task.TERMS, rewards.STEP_TERMS)
-        for name, (weight, scale) in task.TERMS.items():
-            self.assertAlmostEqual(weight, WEIGHTS[name], delta=1e-12)
-            if name != 'heading':
-                self.assertEqual(scale, SCALES[name])
-        self.assertAlmostEqual(sum(w for w, _ in task.TERMS.values()), 1, delta=1e-12)
+        self.assertEqual([term.name for term in task.terms], list(WEIGHTS))
+        for term in task.terms:
+            self.assertAlmostEqual(term.weight, WEIGHTS[term.name], delta=1e-12)
+            self.assertEqual(term.scale, SCALES.get(term.name))
+        self.assertAlmostEqual(sum(term.weight for term in task.terms), 1, delta=1e-12)
 
     def test_factor_of_the_heading_error(self):
         angles = (0.0, np.pi / 2, np.pi, -np.pi / 2, np.pi / 3, 2 * np.pi)
-        found = [rewards.facing(angle) for angle in angles]
+        found = [terms.facing(angle) for angle in angles]
         np.testing.assert_allclose(found, [1, 1 / 16, 0, 1 / 16, 0.75**4, 1], atol=1e-12)
 
     def placed(self, id_, phase, **options):

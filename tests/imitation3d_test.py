@@ -16,7 +16,6 @@ from helpers import (
 )
 
 from trl_suite import motion, suite, terrain
-from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 PLANE, HILLS = 'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills-v0'
@@ -376,8 +375,8 @@ class RewardTest(parameterized.TestCase):
 
     def test_weights_and_scales(self):
         task = suite.make(PLANE).task
-        self.assertIs(task.TERMS, rewards.IMITATION_TERMS)
-        self.assertEqual(dict(task.TERMS), {n: (WEIGHTS[n], SCALES[n]) for n in WEIGHTS})
+        self.assertEqual({term.name: term.weight for term in task.terms}, WEIGHTS)
+        self.assertEqual({term.name: term.scale for term in task.terms}, SCALES)
 
 
 def corners(environment):

@@ -8,6 +8,7 @@ from helpers import made
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
+from trl_suite.tasks import task, terms
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
@@ -221,9 +222,7 @@ class ObservationTest(parameterized.TestCase):
 def observed_terms(environment):
     """Reward terms of the present state, which a start has as well."""
     environment.task.observe()
-    return dict(
-        zip(rewards.IMITATION_TERMS, environment.task.reward_terms[0].tolist(), strict=True)
-    )
+    return environment.info['reward_terms']
 
 
 class RewardTest(parameterized.TestCase):
@@ -237,25 +236,25 @@ class RewardTest(parameterized.TestCase):
         ((0, 0, 0, 0, 0.01), 'root', 0.905), ((0, 0, 0, 0.1, 0), 'com', 0.368),
     )  # fmt: skip
     def test_worked_values(self, errors, term, factor):
-        terms = {
-            name: rewards.term(float(error), *rewards.IMITATION_TERMS[name])
-            for name, error in zip(rewards.IMITATION_TERMS, errors, strict=True)
-        }
-        self.assertAlmostEqual(terms[term] / WEIGHTS[term], factor, delta=5e-4)
-        for other in set(terms) - {term}:
-            self.assertAlmostEqual(terms[other], WEIGHTS[other], delta=1e-12)
+        outcome = task.outcome(1, 0, len(errors))
+        data = terms.terms_data(rewards.IMITATION_TERMS)
+        for name, error in zip(data._fields, errors, strict=True):
+            terms.score(0, float(error), getattr(data, name), outcome)
+        found = dict(zip(data._fields, outcome.reward_terms[0].tolist(), strict=True))
+        self.assertAlmostEqual(found[term] / WEIGHTS[term], factor, delta=5e-4)
+        for other in set(found) - {term}:
+            self.assertAlmostEqual(found[other], WEIGHTS[other], delta=1e-12)
 
     def test_weights_and_scales(self):
-        self.assertEqual({k: w for k, (w, _) in rewards.IMITATION_TERMS.items()}, WEIGHTS)
-        self.assertEqual({k: s for k, (_, s) in rewards.IMITATION_TERMS.items()}, SCALES)
+        self.assertEqual({each.name: each.weight for each in rewards.IMITATION_TERMS}, WEIGHTS)
+        self.assertEqual({each.name: each.scale for each in rewards.IMITATION_TERMS}, SCALES)
         self.assertAlmostEqual(sum(WEIGHTS.values()), 1, delta=1e-12)
 
     def test_joint_angles_are_wrapped(self):
         angles = np.array([0.3, -3.0, 2 * np.pi + 0.3, -7.0, 3 * np.pi + 0.1])
         expected = np.angle(np.exp(1j * angles))
-        np.testing.assert_allclose(rewards.wrap(angles), expected, atol=1e-12)
-        for angle, found in zip(angles, rewards.wrap(angles), strict=True):
-            self.assertEqual(rewards.wrapped(angle), found)
+        found = [terms.wrapped(angle) for angle in angles]
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
     def by_hand(self, environment):
         task = environment.task

@@ -4,7 +4,6 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 TRAIL, FOREST, BLOCKS, MOVERS, SOCCER = (
@@ -50,7 +49,7 @@ def terms(environment):
     """Terms of the reward as they would be of the state of now, by name."""
     task = environment.task
     task.observe()
-    return dict(zip(task.TERMS, task.reward_terms[0].copy(), strict=True))
+    return environment.info['reward_terms']
 
 
 class ObservationTest(parameterized.TestCase):
@@ -102,21 +101,22 @@ class ObservationTest(parameterized.TestCase):
 class RewardTest(parameterized.TestCase):
     def test_weights(self):
         """0.5, 0.05, 0.15, 0.2, 0.1, 0.05 and 0.1 over 1.15."""
-        weights = [weight for weight, _ in rewards.DIRECT_TERMS.values()]
         expected = np.array([0.5, 0.05, 0.15, 0.2, 0.1, 0.05, 0.1]) / 1.15
-        np.testing.assert_allclose(weights, expected)
-        environment, _ = started(SOCCER)
-        self.assertAlmostEqual(sum(weight for weight, _ in environment.task.TERMS.values()), 1)
+        found = [term.weight for term in started(TRAIL)[0].task.terms]
+        np.testing.assert_allclose(found, expected)
+        found = [term.weight for term in started(SOCCER)[0].task.terms]
+        np.testing.assert_allclose(found[:7], expected / 2)
+        self.assertAlmostEqual(sum(found), 1)
 
     def test_reward_is_almost_full_for_a_start_towards_a_far_goal(self):
         """The clip's own pose and velocity, straight towards a goal 10 m ahead."""
         environment, _ = started(TRAIL)
         set_goal(environment, 10.0)
         found = terms(environment)
-        for name, (weight, _) in rewards.DIRECT_TERMS.items():
+        for term in environment.task.terms:
             # Heading and path differ by the rotation of the pelvis in a step.
-            least = 0.0 if name == 'proximity' else 0.95 * weight
-            self.assertBetween(found[name], least, weight + 1e-12, name)
+            least = 0.0 if term.name == 'proximity' else 0.95 * term.weight
+            self.assertBetween(found[term.name], least, term.weight + 1e-12, term.name)
         self.assertAlmostEqual(
             found['proximity'], 0.1 / 1.15 * np.exp(-100 / (0.25 * 9)), delta=1e-12
         )
@@ -202,7 +202,10 @@ class OriginalTest(parameterized.TestCase):
     def test_original_rewards_unobserved_footsteps_and_keeps_its_goal(self):
         environment, _ = started(FOREST, reward='original')
         self.assertEqual(sizes(environment), SIZES)
-        self.assertEqual(list(environment.task.TERMS), list(rewards.STEP_TERMS))
+        self.assertEqual(
+            [term.name for term in environment.task.terms],
+            ['pose', 'velocity', 'end_effector', 'com', 'root', 'heading'],
+        )
         self.assertAlmostEqual(environment.task.plans.length[0], 0.4)
         goal = environment.task.goal[0].copy()
         time_step = environment.step(np.zeros(environment.action_spec().shape))

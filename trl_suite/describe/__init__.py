@@ -20,7 +20,6 @@ from trl_suite.describe.differences import differences_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.components import description
-from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
 from trl_suite.util import tables
 from trl_suite.util.tables import Section, Table, escape, markdown, markdown_table, table
 
@@ -37,7 +36,7 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     for title, parts_ in parts(spec, environment):
         yield title, tables.text(parts_)
-    for title, parts_ in options.disturbances(spec.actuation):
+    for title, parts_ in options.disturbances(spec.actuation, environment.task.observed):
         yield title, tables.text(parts_)
     yield (
         'Differences from the original (reasons in docs/differences.md)',
@@ -54,7 +53,7 @@ def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
     """
     type_, task = task_type(spec), environment.task
     if type_ is None:  # the task is made by a user's class or function
-        yield common.observation(environment, PLANAR_BLOCKS)
+        yield common.observation(environment)
         yield description.action(environment)
         yield description.time(spec, task)
         yield options.options(spec)
@@ -62,7 +61,7 @@ def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
     about = type_.description
     yield from common.character(environment, about.joints(task))
     yield from about.before(task)
-    yield common.observation(environment, about.blocks(task))
+    yield common.observation(environment)
     yield from about.after(task)
     yield about.action(environment)
     yield common.ground(spec)

@@ -11,7 +11,7 @@ import numpy as np
 from trl_suite import characters, terrain
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.components.description import REWARD_WEIGHT, Meanings, floats
+from trl_suite.tasks.components.description import REWARD_WEIGHT, floats
 from trl_suite.util.tables import Section, Table, section
 
 
@@ -70,20 +70,21 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
     return Table(header, cells)
 
 
-def observation(environment: Environment, meanings: Meanings) -> Section:
+def observation(environment: Environment) -> Section:
     """Returns the blocks of the observation."""
-    blocks = environment.blocks
-    size = max(part.stop for part in blocks.values())
     task: Any = environment.task
     spatial = task.character.spec.spatial
     axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
+    size = sum(block.size for block in task.observed)
     return section(
         f'Observation: {size} numbers, in this order{axes}',
         Table(
             ('block', 'from', 'to', 'size', 'unit', 'meaning'),
             [
-                (name, part.start, part.stop, part.stop - part.start, *meanings.get(name, ('', '')))
-                for name, part in blocks.items()
+                (block.name, part.start, part.stop, block.size, block.unit, block.meaning)
+                for block in task.observed
+                if block.size
+                for part in (task.blocks[block.name],)
             ],
         ),
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
+from trl_suite.kinematics.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.disturbances import sensors, worlds
@@ -58,8 +59,13 @@ def options(spec: EnvSpec) -> Section:
     return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
 
 
-def disturbances(actuation: str) -> Iterator[Section]:
-    """Yields the options of actuators, worlds, pushes and sensors, for an actuation model."""
+def disturbances(actuation: str, blocks: Iterable[Block]) -> Iterator[Section]:
+    """Yields the options of actuators, worlds, pushes and sensors.
+
+    Args:
+      actuation: the actuation model.
+      blocks: the observation blocks of the task.
+    """
     omitted = NOT_FOR_MUSCLES if actuation == 'muscle' else ()
     yield section('Options of actuators', table_of(Actuators, omitted))
     yield section(
@@ -73,7 +79,8 @@ def disturbances(actuation: str) -> Iterator[Section]:
     yield section(
         'Options of sensors',
         table_of(sensors.SensorConfig),
-        _presets('sensors', sensors.PRESETS),
+        'Presets, with the values for mild, robot and harsh:',
+        presets_of_sensors(blocks),
     )
 
 
@@ -91,6 +98,20 @@ def table_of(config: type[Config], omitted: Collection[str] = ()) -> Table:
             (field.name, _shown(field.default), data['unit'], ', '.join(limits), data['meaning'])
         )
     return Table(('option', 'default', 'unit', 'bounds', 'meaning'), cells)
+
+
+def presets_of_sensors(blocks: Iterable[Block]) -> Table:
+    """Returns a table of what the presets of sensors do to observation blocks."""
+    cells: list[tuple[object, ...]] = []
+    for block in (block for block in blocks if block.size):
+        if isinstance(block.noise, str):
+            cells.append((block.name, block.unit, 'exact', '', ''))
+        else:
+            shown = [' '.join(f'{value:g}' for value in values) for values in block.noise[:3]]
+            cells.append((block.name, block.unit, *shown))
+    share = ' '.join(f'{value:g}' for value in sensors.TERRAIN_DROPOUT)
+    cells.append(('terrain_dropout', '1', share, '', ''))
+    return Table(('block', 'unit', 'noise', 'bias', 'delay up to'), cells)
 
 
 def _presets(option: str, presets: Mapping[str, Any]) -> str:

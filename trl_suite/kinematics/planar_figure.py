@@ -7,6 +7,7 @@ import numpy as np
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import HEIGHTS, PLACES, SPEEDS, Block
 from trl_suite.kinematics.planar import (
     PlanarBody,
     PlanarMeasurement,
@@ -29,6 +30,7 @@ class PlanarFigure:
       pose_qpos, pose_dof: addresses of x, z, pitch and the joints in link order.
       links, effectors: body ids, in link order.
       geoms: ids of the collision geoms.
+      blocks: the observation blocks of the body.
     """
 
     body: PlanarBody
@@ -60,7 +62,19 @@ class PlanarFigure:
         ends = character.spec.end_effectors if contact else ()
         self._contact_sensors = [self._add_sensor(name, 'contact') for name in ends]
         links = len(character.spec.links)
-        self.blocks = {'terrain': samples, 'pose': 2 * links + 1, 'velocity': 2 * links}
+        # As `trl_suite.kinematics.planar.measure` writes them.
+        self.blocks = (
+            Block(
+                'terrain', samples, 'm',
+                f'ground heights from {behind:g} m behind to {ahead:g} m ahead, relative to the ground under '
+                'the root', HEIGHTS,
+            ),
+            Block(
+                'pose', 2 * links + 1, 'm',
+                'root height above the ground; then x, z of each link centre from the root', PLACES,
+            ),
+            Block('velocity', 2 * links, 'm/s', 'x, z velocity of each link centre', SPEEDS),
+        )  # fmt: skip
 
     def _add_sensor(self, link: str, kind: str) -> str:
         """Adds a sensor of the contacts between a link and the ground; returns its name."""

@@ -12,6 +12,16 @@ from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.engine.native import Engine
+from trl_suite.kinematics.blocks import (
+    HEIGHTS,
+    PLACES,
+    QUATERNION,
+    SPEEDS,
+    SPIN,
+    VECTOR,
+    Block,
+    Reflection,
+)
 from trl_suite.kinematics.spatial import (
     LINK_POSE,
     LINK_VELOCITY,
@@ -23,11 +33,15 @@ from trl_suite.kinematics.spatial import (
     measure_all,
 )
 from trl_suite.motion import quaternion
+from trl_suite.policies.mirror import blocks as mirrored_blocks
+from trl_suite.policies.mirror import exchanged
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES, SpatialWindows, see_movers
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 CLEARANCE = 0.001  # m; between links and ground after the initial placement
+# Reflection of a map, whose lines are from left to right.
+LINES = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1].ravel()
 
 
 class SpatialFigure:
@@ -39,7 +53,7 @@ class SpatialFigure:
       measurement: the last measurement.
       pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
       links: body ids, in link order.
-      blocks: sizes of the observation blocks of the body.
+      blocks: the observation blocks of the body.
     """
 
     body: SpatialBody
@@ -66,12 +80,7 @@ class SpatialFigure:
                 ('contact', character.spec.end_effectors),
             )
         }
-        links = len(character.spec.links)
-        self.blocks = {
-            'terrain': SAMPLES**2 if terrain_observation else 0,
-            'pose': LINK_POSE * links + 1,
-            'velocity': LINK_VELOCITY * links,
-        }
+        self.blocks = body_blocks(character, terrain_observation)
 
     def _add_sensors(self, link: str, kind: str) -> list[str]:
         """Adds sensors of the contacts between a link and the ground; returns their names."""
@@ -158,6 +167,33 @@ class SpatialFigure:
         """
         world = self._world
         put_down_all(env_ids, poses, rates, spawns, self._corners, self._pack, world.pack)
+
+
+def body_blocks(character: Character, terrain_observation: bool) -> tuple[Block, ...]:
+    """Returns the blocks terrain, pose and velocity of a character, as `measure` gives them."""
+    spec = character.spec
+    names = list(spec.links)
+    links = exchanged(len(names), [(names.index(a), names.index(b)) for a, b in spec.mirror])
+    index, sign = mirrored_blocks(links, (*VECTOR, *QUATERNION))
+    return (
+        Block(
+            'terrain', SAMPLES**2 if terrain_observation else 0, 'm',
+            'ground heights relative to the ground under the root, 32 lines from left to right (5.5 m to '
+            'each side), each with 32 points from 1 m behind to 10 m ahead', HEIGHTS,
+            Reflection(LINES, np.ones(len(LINES))),
+        ),
+        Block(
+            'pose', LINK_POSE * len(names) + 1, 'm, 1',
+            'root height above the ground; then for each link the position of its centre from the root and '
+            'its orientation (wxyz)', PLACES,
+            Reflection(np.append(0, 1 + index), np.append(1.0, sign)),
+        ),
+        Block(
+            'velocity', LINK_VELOCITY * len(names), 'm/s, rad/s',
+            'for each link the velocity of its centre relative to the ground under the root, and its '
+            'angular velocity', SPEEDS, Reflection(*mirrored_blocks(links, (*VECTOR, *SPIN))),
+        ),
+    )  # fmt: skip
 
 
 def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:

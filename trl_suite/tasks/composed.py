@@ -20,7 +20,8 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.engine import World
-from trl_suite.tasks.task import Task, consecutive, outcome
+from trl_suite.kinematics.blocks import Block, layout
+from trl_suite.tasks.task import Task, outcome
 from trl_suite.tasks.wrapper import Wrapper
 from trl_suite.util import errors
 
@@ -78,9 +79,10 @@ class Composed(Wrapper):
                 raise ValueError(f'the task already has a block {name!r}; choose another name')
         for name, function in self._failures.items():
             _check('failure', name, function, True, '')
-        sizes = {name: part.stop - part.start for name, part in task.blocks.items()}
-        self.blocks = consecutive(sizes | {name: size for name, (size, _) in self._extras.items()})
-        self._own = sum(sizes.values())
+        added = (Block(name, int(size)) for name, (size, _) in self._extras.items())
+        self._own = sum(block.size for block in task.observed)
+        self.observed = *task.observed, *added
+        self.blocks = layout(self.observed)
         self.mirror = None  # unknown for the added blocks
 
     @property
@@ -92,7 +94,7 @@ class Composed(Wrapper):
     def bind(self, world: World) -> None:
         self.task.bind(world)
         self.world, n = world, world.n
-        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()))
+        self.outcome = outcome(n, sum(block.size for block in self.observed))
         self.action = np.zeros((n, len(self.action_map)))
         self._terms = np.zeros((len(self._rewards), n))
 

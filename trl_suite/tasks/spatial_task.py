@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,19 +13,19 @@ from trl_suite import actuation
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import Block, columns, layout, reflected
 from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.kinematics.spatial_reference import mean_targets
 from trl_suite.motion import Clip, Steps
 from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.components import reflection as reflection3d
+from trl_suite.tasks.components.reflection import action_reflection
 from trl_suite.tasks.components.spatial_rules import (
     _DIGITS,
     ACTION_OFFSETS,
     ACTION_SCALE,
     CONTROL_TIMESTEP,
     HEIGHT_MAP,
-    MIRRORED_BINS,
-    PHASE_BINS,
+    PHASE,
     SUBSTEPS,
     Clock,
     SpatialRules,
@@ -38,9 +38,7 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_position_options,
-    consecutive,
     drawn_seed,
-    outcome,
     start_phases,
 )
 from trl_suite.terrain import SpatialGround
@@ -102,9 +100,9 @@ class SpatialTask(Task):
       clock: phase of each simulation in its cycle.
       period: duration of a cycle, s.
       mirror: reflection of observations and actions, for policies; None if it is not available.
+      full: the blocks of the full observation, from which the observation is derived.
     """
 
-    TERMS: Mapping[str, tuple[float, float]]  # reward terms: weight, and scale of the error
     ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
     fields: tuple[str, ...] = SpatialFigure.fields
     config: Any  # options of the subclass
@@ -119,7 +117,8 @@ class SpatialTask(Task):
         *,
         actuation_model: str = 'position',
         phase: bool = True,
-        extras: Mapping[str, int],
+        extras: tuple[Block, ...],
+        hidden: Collection[str] = (),
     ) -> None:
         """Composes the task; see the subclasses.
 
@@ -130,7 +129,8 @@ class SpatialTask(Task):
           config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
           phase: whether the phase is observed.
-          extras: sizes of the blocks of a subclass, by name.
+          extras: the blocks of a subclass.
+          hidden: names of blocks that are not observed.
 
         Raises:
           ValueError: incompatible options, or a motion that does not fit the character.
@@ -163,17 +163,21 @@ class SpatialTask(Task):
             character, actuation_model, self.physics_timestep, **options
         )
         self.joint_map = self.action_map  # actions to actuators; a subclass may replace action_map
-        full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
-        self._full = self.blocks = consecutive(full)
-        self._reflection = self._reflected() if phase and spec.mirror else None
-        self.mirror: Mirror | None = self._reflection
+        self._extras = extras
+        self._own = *self.figure.blocks, PHASE.observed_if(phase)
+        self.full = *self._own, *extras
+        self._full = layout(self.full)
+        given = tuple(block for block in self.full if block.name not in hidden)
+        self._reflection = self._reflected(self.full)
+        self.mirror = None if mirrored else self._reflected(given)
         self._kept: np.ndarray = np.zeros(0, int)  # all
-        if mirrored:
-            self.mirror = None  # observations are mirrored already
-            self._kept = self._canonical_columns()
-            self.blocks = consecutive({
-                **self.figure.blocks, 'phase': 1 + MIRRORED_BINS, **self._canonical_extras(extras)
-            })  # fmt: skip
+        if mirrored or hidden:
+            self._kept = np.concatenate([
+                self._full[block.name].start + np.array(
+                    block.kept if mirrored and block.kept else range(block.size)
+                ) for block in given if block.size
+            ])  # fmt: skip
+        self.observed = tuple(block.mirrored() for block in given) if mirrored else given
 
     # Methods of a subclass.
 
@@ -190,19 +194,6 @@ class SpatialTask(Task):
         Returns:
           Poses, rates and spawns, see `SpatialFigure.place`.
         """
-
-    @abc.abstractmethod
-    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
-        """Returns the reflection of a block of the subclass."""
-
-    def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns sizes of the blocks of the subclass in mirrored observations."""
-        return extras
-
-    def _canonical_extra_columns(self, name: str) -> np.ndarray:
-        """Returns the columns of a block of the subclass that mirrored observations keep."""
-        part = self._full[name]
-        return np.arange(part.start, part.stop)
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         """Called by `reset` after the characters of some simulations were placed."""
@@ -221,32 +212,39 @@ class SpatialTask(Task):
         self.clock = Clock(np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n))
         self.travel = Travel(np.zeros((n, 3)), np.zeros(n))
         self._random = [np.random.default_rng(0)] * n  # for draws within an episode
-        size = max(part.stop for part in self.blocks.values())
-        self.outcome = outcome(n, size, len(self.TERMS))
+        self._allocate(n, self.travel.distance)
         self._full_observation = self.outcome.observation
-        if self.blocks is not self._full:
-            size = max(part.stop for part in self._full.values())
+        if self.observed != self.full:
+            size = sum(block.size for block in self.full)
             self._full_observation = np.zeros((n, size))
         scope = f'{self.character.mjcf_model.model}/'
         # The controls are consecutive.
         first = int(world.control_addresses([scope + self.joint_map.actuators[0]])[0])
-        starts = {name: part.start for name, part in self._full.items()}
-        self.info_arrays = {
-            'reward_terms': dict(zip(self.TERMS, self.outcome.reward_terms.T, strict=True)),
-            'fell': self.outcome.fell,
-            'diverged': self.outcome.diverged,
-            'distance': self.travel.distance,
-        }
         self.saved = (
             self.clock, self.travel, self.outcome, Full(self._full_observation),
         )  # fmt: skip
         return SpatialRules(
-            world.engine, figure.body, figure.state, figure.ground, self.joint_map.drive(first),
-            world.ctrl, self.period, starts.get('terrain', -1), starts['pose'],
-            starts['velocity'], starts.get('phase', -1), self._view(), self.clock, self.travel,
-            figure.measurement, self._full_observation, np.zeros((n, len(self.joint_map))),
-            np.zeros(n, bool), self.outcome,
-        )  # fmt: skip
+            engine=world.engine,
+            body=figure.body,
+            physics=figure.state,
+            ground=figure.ground,
+            drive=self.joint_map.drive(first),
+            ctrl=world.ctrl,
+            period=self.period,
+            columns=columns(self._own, self._full),
+            given=self._view(),
+            clock=self.clock,
+            travel=self.travel,
+            measurement=figure.measurement,
+            full=self._full_observation,
+            action=np.zeros((n, len(self.joint_map))),
+            leaving=np.zeros(n, bool),
+            outcome=self.outcome,
+        )
+
+    def _extra_columns(self) -> Any:
+        """Returns the first columns of the blocks of the subclass in the full observation."""
+        return columns(self._extras, self._full)
 
     def _view(self) -> View:
         mirror, none = self._reflection, np.zeros(0, int)
@@ -322,30 +320,13 @@ class SpatialTask(Task):
         self._random[env_id] = np.random.default_rng(0)
         self._random[env_id].bit_generator.state = state['random']
 
-    # Left and right.
-
-    def _reflected(self) -> Mirror:
-        """Returns the reflection of full observations and actions."""
-        parts = reflection3d.body(self.character)
-        parts['phase'] = reflection3d.phase(PHASE_BINS)
-        parts |= {name: self._extra_mirror(name) for name in self._full if name not in parts}
-        return Mirror(
-            *reflection3d.joined(self._full, parts),
-            *reflection3d.actions(self.character, self.action_map),
-            self._full['phase'].start,
-        )
-
-    def _canonical_columns(self) -> np.ndarray:
-        """Returns the columns of a full observation in right stance that a mirrored one keeps."""
-        columns = []
-        for name, part in self._full.items():
-            if name == 'phase':
-                columns.append(np.arange(part.start, part.start + 1 + MIRRORED_BINS))
-            elif name in self.figure.blocks:
-                columns.append(np.arange(part.start, part.stop))
-            else:
-                columns.append(self._canonical_extra_columns(name))
-        return np.concatenate(columns)
+    def _reflected(self, blocks: tuple[Block, ...]) -> Mirror | None:
+        """Returns the reflection of these blocks and of actions; None if there is none."""
+        slices = layout(blocks)
+        if 'phase' not in slices or not self.character.spec.mirror:
+            return None
+        actions = action_reflection(self.character, self.action_map)
+        return Mirror(*reflected(blocks), *actions, slices['phase'].start)
 
 
 class Full(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import collections
+import functools
 import numbers
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,6 +17,8 @@ from dm_env import specs
 
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
+from trl_suite.kinematics.blocks import Block, layout
+from trl_suite.tasks.terms import Term
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
 
@@ -131,7 +134,9 @@ class Task(composer.Task):
     Attributes:
       world: the simulations; set by `bind`.
       action_map: the map from actions to physical units.
-      blocks: name -> slice of the observation, in order, terrain first.
+      observed: the blocks of the observation, in order, terrain first; some may be empty.
+      blocks: name -> slice of the observation, in order; a task may set it instead of `observed`.
+      terms: the terms of the reward, in order.
       outcome: observation, reward and failure of each simulation.
       saved: the state of the task: tuples of arrays (n, ...), of which `outcome` is one.
       info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays;
@@ -140,7 +145,7 @@ class Task(composer.Task):
 
     world: World
     action_map: ActionMap
-    blocks: dict[str, slice]
+    terms: tuple[Term, ...] = ()
     outcome: Outcome
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
@@ -181,7 +186,27 @@ class Task(composer.Task):
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         """Writes the observations of some simulations, or of all, from the state of the world."""
 
-    # Step and state, for all tasks.
+    # Observation, step and state, for all tasks.
+
+    @functools.cached_property
+    def observed(self) -> tuple[Block, ...]:
+        return tuple(Block(name, part.stop - part.start) for name, part in self.blocks.items())
+
+    @functools.cached_property
+    def blocks(self) -> dict[str, slice]:
+        return layout(self.observed)
+
+    def _allocate(self, n: int, distance: np.ndarray) -> None:
+        """Allocates the outcome of n simulations; `info` has it, and their distances (n,) in m."""
+        size = sum(block.size for block in self.observed)
+        self.outcome = outcome(n, size, len(self.terms))
+        names = [term.name for term in self.terms]
+        self.info_arrays = {
+            'reward_terms': dict(zip(names, self.outcome.reward_terms.T, strict=True)),
+            'fell': self.outcome.fell,
+            'diverged': self.outcome.diverged,
+            'distance': distance,
+        }
 
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         """Advances some simulations by one step.
@@ -413,13 +438,3 @@ def check_position_options(model: str, action_offset: str, action_scale: float |
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
     """Draws the 128-bit seed of a separate random stream, e.g. for draws within an episode."""
     return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32))
-
-
-def consecutive(sizes: dict[str, int]) -> dict[str, slice]:
-    """Returns consecutive slices for blocks of the given sizes; empty blocks are left out."""
-    ends = np.cumsum(list(sizes.values()))
-    return {
-        name: slice(int(end) - size, int(end))
-        for (name, size), end in zip(sizes.items(), ends, strict=True)
-        if size
-    }

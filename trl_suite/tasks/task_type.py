@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, Steps
 from trl_suite.tasks.components import description
-from trl_suite.tasks.components.description import Meanings
 from trl_suite.tasks.components.differences import Difference
 from trl_suite.tasks.task import Task
 from trl_suite.util.options import Config
@@ -48,7 +47,6 @@ class Description:
     """Functions that describe a task, for `trl-suite info` and the documentation pages.
 
     Attributes:
-      blocks: task -> unit and meaning of each observation block.
       rules: spec, task -> sections on motion, reward and termination.
       before, after: task -> sections before and after the section on the observation.
       action: environment -> section on the meaning of actions.
@@ -57,7 +55,6 @@ class Description:
       legend: meaning of the markers in rendered images.
     """
 
-    blocks: Callable[[Any], Meanings]
     rules: Callable[[EnvSpec, Any], Iterator[Section]] = lambda spec, task: iter(())
     before: Callable[[Any], Iterator[Section]] = lambda task: iter(())
     after: Callable[[Any], Iterator[Section]] = lambda task: iter(())

@@ -24,7 +24,8 @@ class Wrapper(Task):
         """Wraps a task that no other environment uses."""
         self.task = task
         self.set_timesteps(task.control_timestep, task.physics_timestep)
-        self.fields, self.action_map, self.blocks = task.fields, task.action_map, task.blocks
+        self.fields, self.action_map, self.observed = task.fields, task.action_map, task.observed
+        self.blocks, self.terms = task.blocks, task.terms
         self.in_parts = task.in_parts
 
     def __getattr__(self, name: str) -> Any:

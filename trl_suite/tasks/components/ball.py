@@ -5,17 +5,21 @@ Source: the soccer scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import SPIN, VECTOR, Block, Noise, signs
 from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
-from trl_suite.tasks.components.goals import GOAL_COLOUR
+from trl_suite.tasks.components.goals import GOAL, GOAL_COLOUR
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
-from trl_suite.tasks.task import Marker, random_displacement
+from trl_suite.tasks.task import Marker, Outcome, random_displacement
+from trl_suite.tasks.terms import Term, give, terms_data
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline
 
@@ -30,15 +34,38 @@ GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
 AT_GOAL, NEAR = 0.5, 2.0  # m; distances of the ball from goal and walker for full reward
 SPEED = 1.0  # m/s; target speed of walker and ball
 SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
-# Speed of the walker towards the ball, its distance, speed of the ball towards the goal, its
-# distance.
-SOCCER_TERMS = {
-    'approach': (0.2 / 1.2, SPEED_SHARPNESS), 'near': (0.2 / 1.2, BALL_SHARPNESS),
-    'dribble': (0.4 / 1.2, SPEED_SHARPNESS), 'goal': (0.4 / 1.2, GOAL_SHARPNESS),
-}  # fmt: skip
-MIRRORED = (-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # signs of the mirrored block ball
-_WEIGHTS = np.array([weight for weight, _ in SOCCER_TERMS.values()])
-_APPROACH, _NEAR, _DRIBBLE, _GOAL = range(len(SOCCER_TERMS))
+_SPEEDS = f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2)'
+
+
+def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
+    """Returns the terms of a reward for dribbling, whose weights sum to `share`."""
+    return tuple(
+        Term(name, share * weight, meaning)
+        for name, weight, meaning in (
+            ('approach', 0.2 / 1.2, f'{_SPEEDS}, v: speed of the centre of mass towards the ball, m/s'),
+            (
+                'near', 0.2 / 1.2,
+                f'exp(-{BALL_SHARPNESS:g} d^2), d: horizontal distance of the ball from the centre of mass at '
+                'the beginning of the step, m',
+            ),
+            (
+                'dribble', 0.4 / 1.2,
+                f'{_SPEEDS}, v: speed of the ball towards the goal, m/s; 0 unless v > 0',
+            ),
+            (
+                'goal', 0.4 / 1.2,
+                f"exp(-{GOAL_SHARPNESS:g} d), d: distance from the ball's centre to the goal on the ground, m",
+            ),
+        )
+    )  # fmt: skip
+
+
+BALL = Block(
+    'ball', 9, 'rad, m, m/s, rad/s',
+    'bearing, distance and height of the ball; its velocity (3) and its angular velocity (3)',
+    Noise((0.01, 0.03, 0.1)), signs((-1.0, 1.0, 1.0, *VECTOR, *SPIN)),
+)  # fmt: skip
+BALL_GOAL = dataclasses.replace(GOAL, meaning='bearing and distance of the goal from the ball')
 
 
 class BallState(NamedTuple):
@@ -65,17 +92,17 @@ class BallRules(NamedTuple):
     Attributes:
       qpos, dof: first addresses of its position (7) in qpos and velocity (6) in qvel; -1: no ball.
       body: its body id.
-      column: first column of the block ball in the observation.
       target_speed: speed of walker and ball for full reward, m/s.
       goal_radius: distance of the ball from the goal for full reward, if the walker is near, m.
+      terms: the reward terms, of which those of `soccer_terms` are written here.
     """
 
     qpos: int
     dof: int
     body: int
-    column: int
     target_speed: float
     goal_radius: float
+    terms: Any
     state: BallState
 
 
@@ -88,7 +115,7 @@ def ball_state(n: int) -> BallState:
 
 def no_ball(n: int) -> BallRules:
     """Returns the rules for a task without a ball."""
-    return BallRules(-1, -1, -1, -1, 0.0, 0.0, ball_state(n))
+    return BallRules(-1, -1, -1, 0.0, 0.0, terms_data(soccer_terms()), ball_state(n))
 
 
 # Of simulation i.
@@ -106,20 +133,18 @@ def remember(
 
 @compiled
 def dribble(
-    i: int, first: int, share: float, seconds: float, goal: np.ndarray, physics: SpatialState,
-    measurement: SpatialMeasurement, ball: BallRules, terms: np.ndarray,
+    i: int, seconds: float, goal: np.ndarray, physics: SpatialState,
+    measurement: SpatialMeasurement, ball: BallRules, outcome: Outcome,
 ) -> float:  # fmt: skip
     """Writes the reward terms of a step, and whether the ball is at its goal.
 
     Args:
       i: number of the simulation.
-      first: column of the first of the terms of `SOCCER_TERMS`.
-      share: factor of these terms, their share of the reward.
       seconds: duration of the step, s.
       goal: positions of the goals, (n, 3) m.
       physics, measurement: state and measurement of all simulations at the end of the step.
       ball: the balls, with positions at the beginning of the step.
-      terms: reward terms, (n, k).
+      outcome: of which the reward terms are written.
 
     Returns:
       The ball's speed towards the goal, m/s.
@@ -144,17 +169,20 @@ def dribble(
     left = math.sqrt(left_x * left_x + left_y * left_y + left_z * left_z)
     arrived = left < ball.goal_radius
     ball.state.at_goal[i] = arrived
-    lack = min(towards_ball - ball.target_speed, 0.0)
-    terms[i, first + _APPROACH] = math.exp(-SPEED_SHARPNESS * (lack * lack))
-    terms[i, first + _NEAR] = math.exp(-BALL_SHARPNESS * gap)
-    lack = min(towards_goal - ball.target_speed, 0.0)
-    worth = math.exp(-SPEED_SHARPNESS * (lack * lack)) if towards_goal > 0.0 else 0.0
-    terms[i, first + _DRIBBLE] = worth
-    terms[i, first + _GOAL] = math.exp(-GOAL_SHARPNESS * left)
-    for k in range(len(_WEIGHTS)):
-        if arrived and gap < NEAR * NEAR:
-            terms[i, first + k] = 1.0
-        terms[i, first + k] = terms[i, first + k] * _WEIGHTS[k] * share
+    if arrived and gap < NEAR * NEAR:
+        approach = near = dribbling = at_goal = 1.0
+    else:
+        lack = min(towards_ball - ball.target_speed, 0.0)
+        approach = math.exp(-SPEED_SHARPNESS * (lack * lack))
+        near = math.exp(-BALL_SHARPNESS * gap)
+        lack = min(towards_goal - ball.target_speed, 0.0)
+        dribbling = math.exp(-SPEED_SHARPNESS * (lack * lack)) if towards_goal > 0.0 else 0.0
+        at_goal = math.exp(-GOAL_SHARPNESS * left)
+    terms = ball.terms
+    give(i, approach, terms.approach, outcome)
+    give(i, near, terms.near, outcome)
+    give(i, dribbling, terms.dribble, outcome)
+    give(i, at_goal, terms.goal, outcome)
     return towards_goal
 
 
@@ -169,22 +197,21 @@ def _speed_along(
 
 @compiled
 def observe_ball(
-    i: int, column: int, goal: np.ndarray, physics: SpatialState, measurement: SpatialMeasurement,
+    i: int, columns: Any, goal: np.ndarray, physics: SpatialState, measurement: SpatialMeasurement,
     ball: BallRules, observation: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes the blocks goal and ball, in the heading frame of the walker.
+    """Writes the blocks `BALL_GOAL` and `BALL`, in the heading frame of the walker.
 
-    Block goal, at `column`: bearing and distance of the goal (n, 3) from the ball, rad and m. Block
-    ball: bearing, distance and height of the ball, rad, m and m; its velocity (3), m/s; its angular
-    velocity (3), rad/s.
+    Bearings are positive to the left; `goal` (n, 3) m are the positions of the goals.
     """
+    column = columns.goal
     x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
     bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, measurement)
     observation[i, column], observation[i, column + 1] = bearing, distance
     bearing, distance = polar(
         i, x - measurement.root[i, 0], y - measurement.root[i, 1], measurement
     )
-    column = ball.column
+    column = columns.ball
     observation[i, column], observation[i, column + 1] = bearing, distance
     observation[i, column + 2] = physics.qpos[i, ball.qpos + 2]
     ahead, left = ahead_and_left(
@@ -245,10 +272,12 @@ class Ball:
 
         self.state = ball_state(world.n)
 
-    def rules(self, column: int, target_speed: float, goal_radius: float) -> BallRules:
+    def rules(self, target_speed: float, goal_radius: float, terms: Iterable[Term]) -> BallRules:
         """Returns the balls for compiled functions; see `BallRules`."""
         qpos, dof = int(self.qpos[0]), int(self.dof[0])
-        return BallRules(qpos, dof, int(self._body), column, target_speed, goal_radius, self.state)
+        return BallRules(
+            qpos, dof, int(self._body), target_speed, goal_radius, terms_data(terms), self.state
+        )
 
     @property
     def place(self) -> np.ndarray:

@@ -7,29 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.tasks.components import rewards
 from trl_suite.util.tables import Section, Table, section
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.registry.spec import EnvSpec
 
-Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks
 REWARD_WEIGHT = 'reward weight'  # title of a column of links
-REWARD = 'Reward: sum of weight * exp(-scale * error), at most 1; 0 after a fall'
-PLAN_BLOCKS: Meanings = {
-    'contact': ('1', 'whether the right and the left foot touch the ground'),
-    'plan': ('m, rad', 'footstep plan, see below'),
-}
-# Quantities that terms of a reward compare with the reference motion.
-_ERRORS = {
-    'pose': 'angles of joints and root, mean with the weights in Links; rad^2',
-    'velocity': 'angular velocities of joints and root, mean with the same weights; rad^2/s^2',
-    'com': f'velocity of the centre of mass ({rewards.COM_ERROR_FACTOR:g} times the squared difference); m^2/s^2',
-    'root': 'height of the root above the ground; m^2',
-    'heading': 'see below',
-}
-_ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
 
 # Size, unit and meaning of the parts of a plan.
 _PLAN = (
@@ -51,28 +35,26 @@ def reward_weights(task: Any) -> tuple[str, Iterable[object]]:
     return REWARD_WEIGHT, [joint.weight for joint in task.character.spec.joints.values()]
 
 
-def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
-    """Returns the table of reward terms for tracking.
-
-    Args:
-      task: the task.
-      steps: whether it tracks footsteps, not a clip.
-      more: meanings of terms that only this task has; terms without a meaning are left out.
-    """
-    average = 'sum' if steps else 'mean'
-    errors = {
-        **_ERRORS,
-        'end_effector': f'positions of the end effectors from {_ABOUT[task.ABOUT]} and heights above the '
-        f'ground, {average} over end effectors; m^2',
-        **more,
-    }
-    return Table(
-        ('term', 'weight', 'scale', 'error: squared difference of'),
-        [
-            (name, weight, '' if name == 'heading' else scale, errors[name])
-            for name, (weight, scale) in task.TERMS.items()
-            if name in errors
-        ],
+def reward(task: Any, *notes: str, title: str = 'Reward of a step') -> Section:
+    """Returns the table of reward terms, and notes on them."""
+    return section(
+        f'{title}: sum of weight * exp(-scale * error), or without a scale of weight * share; at most 1; 0 '
+        'after a fall',
+        Table(
+            ('term', 'weight', 'scale', 'unit', 'error, or share'),
+            [
+                (
+                    term.name,
+                    term.weight,
+                    '' if term.scale is None else term.scale,
+                    term.unit,
+                    term.meaning,
+                )
+                for term in task.terms
+                if term.weight
+            ],
+        ),
+        *notes,
     )
 
 

@@ -3,19 +3,39 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.characters import CharacterSpec
+from trl_suite.kinematics.blocks import VECTOR, Block, Noise, Reflection
 from trl_suite.kinematics.spatial import SpatialMeasurement, ahead_and_left
-from trl_suite.tasks.components.rewards import wrapped
 from trl_suite.tasks.task import Marker
+from trl_suite.tasks.terms import wrapped
 from trl_suite.util.compiled import compiled
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
 SIDE = np.array([-1.0, 1.0])  # sign of y of each foot
-CONTACT_SIZE, PLAN_SIZE = 2, 13
+PLAN_SIZE = 13
+CONTACT = Block(
+    'contact',
+    2,
+    '1',
+    'whether the right and the left foot touch the ground',
+    Noise((0.002, 0.01, 0.05), kind='flags'),
+    Reflection(np.array([1, 0]), np.ones(2)),
+    kept_meaning='whether the stance and the swing foot touch the ground',
+)
+# Of a reflected plan, the landing places of the two feet are exchanged. Mirrored observations keep the
+# heading, the first landing place from the left foot, and the second from the right foot.
+PLAN = Block(
+    'plan', PLAN_SIZE, 'm, rad', 'footstep plan, see below', Noise((0.003, 0.01, 0.02)),
+    Reflection(
+        np.append(np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel(), 12),
+        np.append(np.tile(VECTOR, 4), -1.0),
+    ),
+    kept=(12, 3, 4, 5, 6, 7, 8),
+)  # fmt: skip
 SOLE, SOLE_AHEAD = (
     (0.0885, 0.045, 0.004),
     0.052,
@@ -81,12 +101,16 @@ def update_stance(
 
 @compiled
 def observe_plan(
-    i: int, contact: int, column: int, measurement: SpatialMeasurement, plan: FootstepPlan,
+    i: int,
+    columns: Any,
+    measurement: SpatialMeasurement,
+    plan: FootstepPlan,
     observation: np.ndarray,
-) -> None:  # fmt: skip
-    """Writes the blocks contact and plan, from these columns on; see `SpatialFootsteps`."""
+) -> None:
+    """Writes the blocks `CONTACT` and `PLAN`; see `SpatialFootsteps`."""
+    column = columns.plan
     for foot in range(2):
-        observation[i, contact + foot] = measurement.contact[i, foot]
+        observation[i, columns.contact + foot] = measurement.contact[i, foot]
     for k in range(PLAN_SIZE - 1):
         observation[i, column + k] = 0.0
     for which in range(2):
@@ -100,15 +124,6 @@ def observe_plan(
         observation[i, slot + 2] = plan.landing[i, which, 2] - measurement.under[i]
     off = wrapped(plan.heading[i] - measurement.heading[i])
     observation[i, column + PLAN_SIZE - 1] = off
-
-
-def plan_mirror(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the reflection of the block contact or plan: index and sign."""
-    if name == 'contact':
-        return np.array([1, 0]), np.ones(CONTACT_SIZE)
-    index = np.arange(PLAN_SIZE)
-    index[:12] = np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel()
-    return index, np.append(np.tile([1.0, -1.0, 1.0], 4), -1.0)
 
 
 def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Marker]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.kinematics.blocks import Block, Noise, signs
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.task import Marker
 
@@ -41,6 +42,12 @@ def set_goal(
     """Sets a goal (3,) m at control step `count` of the episode, and draws when it expires."""
     goals.place[env_id] = place
     goals.due[env_id] = count + round(random.uniform(*GOAL_LASTS) / CONTROL_TIMESTEP)
+
+
+GOAL = Block(
+    'goal', 2, 'rad, m', 'bearing (positive to the left) and distance of the goal',
+    Noise((0.01, 0.03, 0.1)), signs((-1.0, 1.0)),
+)  # fmt: skip
 
 
 def flag(goal: Any) -> Marker:

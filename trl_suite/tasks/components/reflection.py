@@ -1,48 +1,17 @@
-"""Reflection of observations and actions of 3D walkers in the x-z plane.
-
-A reflection of k columns is an index and a sign, both (k,): the result is `x[index] * sign`; see
-`trl_suite.policies.mirror`.
-"""
+"""Reflection of the actions of 3D walkers in the x-z plane."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap, AngleAxisMap
 from trl_suite.characters import Character
-from trl_suite.policies.mirror import blocks, exchanged
-from trl_suite.terrain.spatial.surroundings import SAMPLES
+from trl_suite.kinematics.blocks import SPIN, Reflection
 
-Reflection = tuple[np.ndarray, np.ndarray]
-# Signs of a vector, of a quaternion, and of a pseudovector such as an angular velocity.
-VECTOR, QUATERNION, SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
 ANGLE_AXIS = (1.0, -1.0, -1.0, 1.0)  # angle; forward, up, right
-POSE = (*VECTOR, *QUATERNION)  # of the numbers of a link in the block pose
 
 
-def body(character: Character) -> dict[str, Reflection]:
-    """Returns reflections of the blocks terrain, pose and velocity."""
-    spec = character.spec
-    names = list(spec.links)
-    pairs = [(names.index(a), names.index(b)) for a, b in spec.mirror]
-    links = exchanged(len(names), pairs)
-    grid = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1]  # lines from the left
-    index, sign = blocks(links, POSE)
-    return {
-        'terrain': (grid.ravel(), np.ones(grid.size)),
-        'pose': (np.append(0, 1 + index), np.append(1.0, sign)),
-        'velocity': blocks(links, (*VECTOR, *SPIN)),
-    }
-
-
-def phase(bins: int) -> Reflection:
-    """Returns the reflection of the block phase: a phase, and the one-hot of its part, `bins`."""
-    return np.append(0, 1 + np.roll(np.arange(bins), bins // 2)), np.ones(1 + bins)
-
-
-def actions(character: Character, action_map: ActionMap) -> Reflection:
+def action_reflection(character: Character, action_map: ActionMap) -> Reflection:
     """Returns the reflection of actions, i.e. joint targets or torques."""
     spec = character.spec
     joints = list(spec.joints)
@@ -58,10 +27,4 @@ def actions(character: Character, action_map: ActionMap) -> Reflection:
         width = len(ball) if character.spherical[joints.index(a)] else 1
         index[i : i + width] = np.arange(j, j + width)
         index[j : j + width] = np.arange(i, i + width)
-    return index, np.array(signs)
-
-
-def joined(layout: Mapping[str, slice], parts: Mapping[str, Reflection]) -> Reflection:
-    """Returns the reflection of an observation from its layout and those of its blocks."""
-    index = np.concatenate([part.start + parts[name][0] for name, part in layout.items()])
-    return index, np.concatenate([parts[name][1] for name in layout])
+    return Reflection(index, np.array(signs))

@@ -1,68 +1,53 @@
-"""Weights and scales of reward terms, and the functions that they share."""
+"""Reward terms of tasks that track a reference motion."""
 
 from __future__ import annotations
 
-import math
+from trl_suite.tasks.terms import Term
 
-import numpy as np
-
-from trl_suite.util.compiled import compiled
-
-# The imitation reward: weight * exp(-scale * error), weights summing to 1.
-# Source: the imitation scenario of the original; 'Does the choice of action space matter?'
-# (Peng & van de Panne 2017) has the same structure.
-IMITATION_TERMS: dict[str, tuple[float, float]] = {
-    'pose': (0.5, 2.0),
-    'velocity': (0.05, 0.005),
-    'end_effector': (0.15, 40.0),
-    'com': (0.2, 10.0),
-    'root': (0.1, 10.0),
-}
-# The reward of footstep controllers, of the same structure; its end-effector error includes the
-# landing place, and `heading` is a power of a cosine (see `facing`), so that its scale is unused.
-# Source: the step scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
-STEP_TERMS: dict[str, tuple[float, float]] = {
-    'pose': (0.5 / 1.05, 2.0),
-    'velocity': (0.05 / 1.05, 0.005),
-    'end_effector': (0.2 / 1.05, 5.0),
-    'com': (0.1 / 1.05, 10.0),
-    'root': (0.1 / 1.05, 10.0),
-    'heading': (0.1 / 1.05, 0.0),
-}
-# Imitation while walking to a goal, after the original's scenario with a goal: velocity and heading
-# are compared with the direction of the goal unless it is near, and the error of `proximity` is the
-# squared ratio of the distance to the radius that counts as near.
-DIRECT_TERMS: dict[str, tuple[float, float]] = {
-    'pose': (0.5 / 1.15, 2.0),
-    'velocity': (0.05 / 1.15, 0.005),
-    'end_effector': (0.15 / 1.15, 40.0),
-    'com': (0.2 / 1.15, 10.0),
-    'root': (0.1 / 1.15, 10.0),
-    'heading': (0.05 / 1.15, 0.0),
-    'proximity': (0.1 / 1.15, 4.0),
-}
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
 
-@compiled
-def term(error: float, weight: float, scale: float) -> float:
-    """Returns weight * exp(-scale * error)."""
-    return weight * math.exp(-scale * error)
+def tracking_terms(
+    about: str, average: str, **weights_and_scales: tuple[float, float]
+) -> tuple[Term, ...]:
+    """Returns the terms that compare a character with its reference motion.
+
+    Args:
+      about: origin of end effector positions.
+      average: 'mean' or 'sum' over end effectors.
+      weights_and_scales: weight of each term, and scale of its error, by name.
+    """
+    errors = {
+        'pose': ('rad^2', 'squared differences of the angles of joints and root, mean with the weights in Links'),
+        'velocity': (
+            'rad^2/s^2', 'squared differences of their angular velocities, mean with the same weights',
+        ),
+        'end_effector': (
+            'm^2', f'squared differences of the positions of the end effectors from {about} and their heights above '
+            f'the ground, {average} over end effectors',
+        ),
+        'com': (
+            'm^2/s^2', f'{COM_ERROR_FACTOR:g} times the squared difference of the velocities of the centre of mass',
+        ),
+        'root': ('m^2', 'squared difference of the heights of the root above the ground'),
+    }  # fmt: skip
+    return tuple(
+        Term(name, weight, meaning, scale, unit)
+        for name, (weight, scale) in weights_and_scales.items()
+        for unit, meaning in (errors[name],)
+    )
 
 
-@compiled
-def facing(error: float) -> float:
-    """Returns ((1 + cos error) / 2)^4 for an error in rad: 1 if it is 0, 0 if it is pi."""
-    half = 0.5 + 0.5 * math.cos(error)
-    return half * half * half * half
-
-
-@compiled
-def wrapped(angle: float) -> float:
-    """Returns an angle in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
-    return angle - 2 * math.pi * np.rint(angle / (2 * math.pi))
-
-
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Returns angles in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
-    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
+# Source: the imitation scenario of the original; 'Does the choice of action space matter?' (Peng &
+# van de Panne 2017) has the same structure.
+IMITATION_TERMS = tracking_terms(
+    'the centre of mass', 'mean', pose=(0.5, 2.0), velocity=(0.05, 0.005), end_effector=(0.15, 40.0),
+    com=(0.2, 10.0), root=(0.1, 10.0),
+)  # fmt: skip
+# Of footstep controllers, whose end-effector error includes the landing place. Source: the step
+# scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
+STEP_TERMS = tracking_terms(
+    'the root', 'sum', pose=(0.5 / 1.05, 2.0), velocity=(0.05 / 1.05, 0.005),
+    end_effector=(0.2 / 1.05, 5.0), com=(0.1 / 1.05, 10.0), root=(0.1 / 1.05, 10.0),
+)  # fmt: skip
+HEADING_WEIGHT = 0.1 / 1.05  # of the term heading, which footstep controllers have as well

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from trl_suite import terrain
 from trl_suite.tasks.components import ball, goals
-from trl_suite.tasks.components.description import PLAN_BLOCKS, Meanings, plan, span
+from trl_suite.tasks.components.description import plan, span
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
@@ -15,56 +15,6 @@ from trl_suite.util.tables import Section, Table, section
 
 if TYPE_CHECKING:
     from trl_suite.registry.spec import EnvSpec
-
-BLOCKS: Meanings = {
-    'terrain': (
-        'm',
-        'ground heights relative to the ground under the root, 32 lines from left to right (5.5 m to '
-        'each side), each with 32 points from 1 m behind to 10 m ahead',
-    ),
-    'pose': (
-        'm, 1',
-        'root height above the ground; then for each link the position of its centre from the root and '
-        'its orientation (wxyz)',
-    ),
-    'velocity': (
-        'm/s, rad/s',
-        'for each link the velocity of its centre relative to the ground under the root, and its '
-        'angular velocity',
-    ),
-    'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
-    'reference': (
-        'm, m/s',
-        'root height, link centres from the root, and velocities of link centres of the reference',
-    ),
-    'goal': (
-        'rad, m',
-        'bearing (positive to the left) and distance of the point 3 m ahead on the line along +x through '
-        'the start',
-    ),
-    **PLAN_BLOCKS,
-}
-# Block goal of other tasks, without and with a ball.
-TARGETS = {
-    False: ('rad, m', 'bearing (positive to the left) and distance of the goal'),
-    True: ('rad, m', 'bearing and distance of the goal from the ball'),
-}
-BALL_BLOCK = (
-    'rad, m, m/s, rad/s',
-    'bearing, distance and height of the ball; its velocity (3) and its angular velocity (3)',
-)
-_MIRRORED_BLOCKS = {
-    'phase': ('1', 'phase of the step in [0, 1); then the one-hot of its half'),
-    'contact': ('1', 'whether the stance and the swing foot touch the ground'),
-}
-
-
-def blocks(task: Any) -> Meanings:
-    """Returns units and meanings of the observation blocks."""
-    meanings = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
-    if hasattr(task, 'goals') or getattr(task, 'hidden_plan', False):
-        meanings['goal'] = TARGETS['ball' in task.blocks]
-    return meanings
 
 
 def after(task: Any) -> Iterator[Section]:
@@ -142,27 +92,6 @@ def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
 def _layout(spec: EnvSpec) -> Layout:
     """Returns the layout of the ground of an environment's terrain."""
     return SpatialGround(terrain.load(spec.part('terrain')), 0).layout
-
-
-def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
-    """Returns formulas of the reward terms for a ball, and when all of them reach their maximum.
-
-    Args:
-      speed: target speed of walker and ball, m/s.
-      reached: distance of the ball from the goal within which all terms are at their maximum, m.
-    """
-    speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
-    formulas = [
-        f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
-        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: horizontal distance of the ball from the centre of mass at '
-        'the beginning of the step, m',
-        f'{speeds}, v: speed of the ball towards the goal, m/s; the term is 0 unless v > 0',
-        f"exp(-{ball.GOAL_SHARPNESS:g} d), d: distance from the ball's centre to the goal on the ground, m",
-    ]
-    return formulas, (
-        f'all four terms are at their maximum while the ball is within {reached:g} m of the goal and within '
-        f'{ball.NEAR:g} m of the walker'
-    )
 
 
 def _seconds(span: tuple[float, float]) -> str:

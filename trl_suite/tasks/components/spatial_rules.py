@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.engine import native
+from trl_suite.kinematics.blocks import CLOCK, Block, Reflection
 from trl_suite.kinematics.spatial import (
     SpatialBody,
     SpatialMeasurement,
@@ -31,7 +32,6 @@ HEIGHT_MAP = "observed map of the terrain: 'height', or () for none"
 SUBSTEPS = 10  # physics at 300 Hz: trained policies score the same as at 600 Hz, less below 180 Hz
 ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
 PHASE_BINS = 4
-MIRRORED_BINS = 2  # for the phase of a single step
 ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 _DIGITS = 1e9  # the clock is rounded to 1 / _DIGITS of a cycle
 
@@ -92,7 +92,7 @@ class SpatialRules(NamedTuple):
     Attributes:
       ctrl: controls of the physics, (n, ...).
       period: period of the reference motion, s.
-      terrain, pose, velocity, phase: first columns of these blocks in the full observation; -1:
+      columns: first columns of the blocks that `observe_body` writes, in the full observation; -1:
         absent.
       full: the full observation, (n, size).
       action: actions after reflection, (n, k); scratch.
@@ -106,10 +106,7 @@ class SpatialRules(NamedTuple):
     drive: Drive
     ctrl: np.ndarray
     period: float
-    terrain: int
-    pose: int
-    velocity: int
-    phase: int
+    columns: Any
     given: View
     clock: Clock
     travel: Travel
@@ -199,13 +196,25 @@ def measure(i: int, rules: SpatialRules) -> None:
 @compiled
 def observe_body(i: int, rules: SpatialRules) -> None:
     """Writes the blocks terrain, pose, velocity and phase of the full observation."""
-    write_terrain(i, rules.terrain, rules.ground, rules.measurement, rules.full)
-    write_body(i, rules.pose, rules.velocity, rules.measurement, rules.full)
-    if rules.phase >= 0:
+    columns, full = rules.columns, rules.full
+    write_terrain(i, columns.terrain, rules.ground, rules.measurement, full)
+    write_body(i, columns.pose, columns.velocity, rules.measurement, full)
+    if columns.phase >= 0:
         phase = rules.clock.phase[i]
-        rules.full[i, rules.phase] = phase
+        full[i, columns.phase] = phase
         for k in range(PHASE_BINS):
-            rules.full[i, rules.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
+            full[i, columns.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
+
+
+# Its phase is that of the cycle; a mirrored observation has that of the step.
+PHASE = Block(
+    'phase', 1 + PHASE_BINS, '1', 'phase of the cycle in [0, 1); then the one-hot of its quarter', CLOCK,
+    Reflection(
+        np.append(0, 1 + np.roll(np.arange(PHASE_BINS), PHASE_BINS // 2)), np.ones(1 + PHASE_BINS)
+    ),
+    kept=tuple(range(1 + PHASE_BINS // 2)),
+    kept_meaning='phase of the step in [0, 1); then the one-hot of its half',
+)  # fmt: skip
 
 
 @compiled

@@ -8,24 +8,19 @@ phase, the reference, and the observation of a footstep controller.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.tasks.disturbances.worlds import bounds, preset_and_options
+from trl_suite.kinematics.blocks import LEVELS, Block, layout
+from trl_suite.tasks.disturbances.worlds import bounds
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop
 from trl_suite.util.options import Config, option
 from trl_suite.util.random import random, standard_normal
 
-MAPS = ('terrain', 'surface')  # blocks that describe the ground
-FLAGS = ('contact',)  # blocks of zeros and ones
-EXACT = {
-    'phase': "the phase is the controller's own clock",
-    'reference': 'the reference is known to the controller',
-    'low_level': 'the footstep controller has its own observation',
-}
+TERRAIN_DROPOUT = (0.01, 0.05, 0.15)  # of the presets
 MOST_DELAY = 1000  # steps
 FRESH, NEXT, AGAIN = range(3)  # a new episode; the next step; the same state once more
 
@@ -34,29 +29,27 @@ FRESH, NEXT, AGAIN = range(3)  # a new episode; the next step; the same state on
 class SensorConfig(Config):
     """Options of sensors; numbers are for all measured blocks, mappings for blocks by name."""
 
-    preset: str | None = option(
-        None, 'preset that the other options change', choices=('mild', 'robot', 'harsh')
-    )
+    preset: str | None = option(None, 'preset that the other options change', choices=LEVELS)
     noise: Any = option(
-        0.0,
+        None,
         'standard deviation of Gaussian noise in every step, in the units of the block; for `contact`, the '
-        'probability that a flag is wrong',
+        'probability that a flag is wrong; by default 0, or that of the preset',
     )  # fmt: skip
     bias: Any = option(
-        0.0,
+        None,
         'standard deviation of a Gaussian offset, drawn at the start of an episode for each number of a '
-        'block; a map of the ground has a single one',
+        'block; a map of the ground has a single one; by default 0, or that of the preset',
     )  # fmt: skip
-    terrain_dropout: float = option(
-        0.0,
+    terrain_dropout: float | None = option(
+        None,
         'probability that a number of a map of the ground is missing in a step; it is then observed as 0, '
-        'the height of the ground under the root',
+        'the height of the ground under the root; by default 0, or that of the preset',
         at_least=0, at_most=1,
     )  # fmt: skip
     delay: Any = option(
-        0,
+        None,
         'age of what is observed, in steps of the environment (in gaits, cycles); a pair of bounds: drawn '
-        'for each episode and block',
+        'for each episode and block; by default 0, or that of the preset if steps last 1/30 s',
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -78,60 +71,25 @@ class SensorConfig(Config):
                 raise ValueError(message)
 
 
-# Noise of 'robot': uniform noise of +-a has the standard deviation a / sqrt(3). legged_gym
-# (`legged_robot_config.py`; Rudin et al. 2022) has +-0.1 m for heights of the ground and +-0.1 m/s
-# for velocities of the base; +-0.01 rad for joint angles, in MuJoCo Playground 0.03 rad, which are
-# 5 to 15 mm at the end of a leg of 0.5 m. Bias, drop-outs and delays are chosen, and so are the
-# other presets: about a third of 'robot', and twice as much.
-PRESETS: Mapping[str, Mapping[str, Any]] = {
-    'mild': {
-        'noise': {
-            'terrain': 0.02, 'surface': 0.02, 'pose': 0.003, 'velocity': 0.02, 'strain': 0.003,
-            'contact': 0.002, 'plan': 0.003, 'goal': 0.01, 'ball': 0.01, 'target_heading': 0.005,
-        },
-        'bias': {'terrain': 0.005, 'pose': 0.002},
-        'terrain_dropout': 0.01,
-    },
-    'robot': {
-        'noise': {
-            'terrain': 0.06, 'surface': 0.06, 'pose': 0.01, 'velocity': 0.06, 'strain': 0.01,
-            'contact': 0.01, 'plan': 0.01, 'goal': 0.03, 'ball': 0.03, 'target_heading': 0.02,
-        },
-        'bias': {'terrain': 0.02, 'pose': 0.005},
-        'terrain_dropout': 0.05,
-        'delay': {'terrain': (0, 2), 'surface': (0, 2)},
-    },
-    'harsh': {
-        'noise': {
-            'terrain': 0.12, 'surface': 0.12, 'pose': 0.02, 'velocity': 0.15, 'strain': 0.02,
-            'contact': 0.05, 'plan': 0.02, 'goal': 0.1, 'ball': 0.1, 'target_heading': 0.05,
-        },
-        'bias': {'terrain': 0.05, 'pose': 0.01},
-        'terrain_dropout': 0.15,
-        'delay': {'terrain': (0, 6), 'surface': (0, 6)},
-    },
-}  # fmt: skip
-
-
 def configure(value: Any) -> SensorConfig | None:
-    """Returns the options of sensors; see `worlds.configure` for the forms of the value.
+    """Returns the options of sensors.
+
+    Args:
+      value: None; the name of a preset; a mapping of options by name, in which 'preset' may name a
+        preset that the other options change; or a `SensorConfig`.
 
     Raises:
-      ValueError: unknown names, or values out of range.
+      ValueError: anything else, unknown names, or values out of range.
     """
-    return preset_and_options('sensors', value, SensorConfig, PRESETS)
-
-
-def fitting(config: SensorConfig, long_steps: bool) -> SensorConfig:
-    """Returns options without the delay of a preset, if steps are gait cycles or footsteps.
-
-    The delays of presets are meant for steps of 1/30 s. An explicit delay counts steps, however
-    long they are.
-    """
-    preset = PRESETS.get(config.preset or '', {})
-    if long_steps and config.delay == preset.get('delay'):
-        return dataclasses.replace(config, delay=0)
-    return config
+    if value is None or isinstance(value, SensorConfig):
+        return value
+    if isinstance(value, str):
+        value = {'preset': value}
+    if not isinstance(value, Mapping):
+        raise ValueError(
+            f'sensors is {value!r}; expected {", ".join(map(repr, LEVELS))}, or a dict of options'
+        )
+    return SensorConfig.of('sensors', value) if value else None
 
 
 class SensorState(NamedTuple):
@@ -182,66 +140,82 @@ class SensorRules(NamedTuple):
     state: SensorState
 
 
-def rules(config: SensorConfig, blocks: Mapping[str, slice], exact: np.ndarray) -> SensorRules:
+def rules(
+    config: SensorConfig, blocks: Sequence[Block], exact: np.ndarray, long_steps: bool
+) -> SensorRules:
     """Allocates sensors.
 
     Args:
       config: the options; see `check` for which fit the blocks.
-      blocks: slices of the blocks of an observation.
+      blocks: the blocks of an observation.
       exact: the exact observations, (n, size).
+      long_steps: whether steps are gait cycles or footsteps: presets then have no delay.
     """
     n, size = exact.shape
     noise, bias, wrong, dropout = np.zeros((4, size))
     shared, delay = np.zeros((2, size), bool), np.zeros((size, 2), int)
-    for name, part in blocks.items():
-        if name in EXACT:
+    slices = layout(blocks)
+    for block in blocks:
+        if isinstance(block.noise, str) or not block.size:
             continue
-        target = wrong if name in FLAGS else noise
-        target[part] = _of(config.noise, name, flags=False)
-        bias[part] = _of(config.bias, name, flags=False)
-        delay[part] = bounds('delay', _of(config.delay, name))
+        name, part, measured = block.name, slices[block.name], block.noise
+        flags = measured.kind == 'flags'
+        target = wrong if flags else noise
+        target[part] = _of(config.noise, name, _at(config.preset, measured.noise), flags)
+        bias[part] = _of(config.bias, name, _at(config.preset, measured.bias), flags)
+        latest = 0 if long_steps else _at(config.preset, measured.delay)
+        delay[part] = bounds('delay', _of(config.delay, name, (0, latest), False))
         shared[1, part.start + 1 : part.stop] = True
-        if name in MAPS:
-            dropout[part] = config.terrain_dropout
+        if measured.kind == 'map':
+            given = config.terrain_dropout
+            dropout[part] = _at(config.preset, TERRAIN_DROPOUT) if given is None else given
             shared[0, part.start + 1 : part.stop] = True
     depth = int(delay.max()) + 1 if delay.any() else 0
     state = SensorState(
-        np.zeros((n, size)), np.zeros((n, size)), np.zeros((n, size)), np.zeros((n, size), bool),
-        np.zeros((n, size), int), np.zeros(n, int), np.zeros((n, depth, size)),
-        np.zeros((n, 6), np.uint64),
-    )  # fmt: skip
+        observation=np.zeros((n, size)),
+        bias=np.zeros((n, size)),
+        noise=np.zeros((n, size)),
+        missing=np.zeros((n, size), bool),
+        delay=np.zeros((n, size), int),
+        head=np.zeros(n, int),
+        history=np.zeros((n, depth, size)),
+        stream=np.zeros((n, 6), np.uint64),
+    )
     return SensorRules(exact, noise, bias, wrong, dropout, shared, delay, state)
 
 
-def check(config: SensorConfig, blocks: Mapping[str, slice]) -> None:
+def check(config: SensorConfig, blocks: Sequence[Block]) -> None:
     """Checks that the options fit the observation blocks of a task.
-
-    Options of a preset may name blocks that the task does not have.
 
     Raises:
       ValueError: an unknown block, one that is exact, or an option that has no effect.
     """
-    preset = PRESETS.get(config.preset or '', {})
+    found = {block.name: block.noise for block in blocks if block.size}
+    kinds = {name: 'exact' if isinstance(how, str) else how.kind for name, how in found.items()}
     for name in ('noise', 'bias', 'delay'):
         given = getattr(config, name)
-        if given == preset.get(name) or not isinstance(given, Mapping):
-            continue
-        for block in given:
-            if block not in blocks:
-                raise ValueError(errors.unknown(f'block in {name}', block, blocks))
-            if block in EXACT:
-                raise ValueError(f'{name} of block {block!r}: {EXACT[block]}, so it is exact')
-            if block in FLAGS and name == 'bias':
+        for block, value in given.items() if isinstance(given, Mapping) else ():
+            if block not in found:
+                raise ValueError(errors.unknown(f'block in {name}', block, found))
+            if kinds[block] == 'exact':
+                raise ValueError(f'{name} of block {block!r}: {found[block]}, so it is exact')
+            if kinds[block] == 'flags' and name == 'bias':
                 raise ValueError(f'bias of block {block!r}: flags have no bias, only noise')
-            if block in FLAGS and name == 'noise' and given[block] > 1:
-                raise ValueError(f'noise of block {block!r} is {given[block]}; it is a probability')
-    own = config.terrain_dropout != preset.get('terrain_dropout', 0.0)
-    if own and not any(name in blocks for name in MAPS):
+            if kinds[block] == 'flags' and name == 'noise' and value > 1:
+                raise ValueError(f'noise of block {block!r} is {value}; it is a probability')
+    if config.terrain_dropout is not None and 'map' not in kinds.values():
         raise ValueError('terrain_dropout has no effect: the task does not observe the ground')
 
 
+def _at(preset: str | None, values: Sequence[Any]) -> Any:
+    """Returns the value for a preset; 0 without one."""
+    return 0 if preset is None else values[LEVELS.index(preset)]
+
+
 def _entries(value: Any) -> list[tuple[str, Any]]:
-    """Returns names and values of a mapping, or one value without a name."""
+    """Returns names and values of a mapping, or one value without a name; nothing for None."""
+    if value is None:
+        return []
     return list(value.items()) if isinstance(value, Mapping) else [('', value)]
 
 
@@ -249,11 +223,13 @@ def _number(value: Any) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
-def _of(given: Any, name: str, flags: bool = True) -> Any:
-    """Returns the value for a block; a number for all blocks is not for flags, unless `flags`."""
+def _of(given: Any, name: str, default: Any, flags: bool) -> Any:
+    """Returns the value for a block; a number for all blocks is not for flags."""
+    if given is None:
+        return default
     if isinstance(given, Mapping):
         return given.get(name, 0)
-    return given if flags or name not in FLAGS else 0
+    return 0 if flags else given
 
 
 @compiled

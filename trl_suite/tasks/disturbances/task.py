@@ -55,15 +55,12 @@ class Disturbed(Wrapper):
         Raises:
           ValueError: options that the task cannot have.
         """
-        if sensor is not None:
-            # Tasks whose steps last longer than 1/30 s have a callback within steps.
-            sensor = sensors.fitting(sensor, hasattr(task, 'watch'))
         self._world_config, self._sensor_config = world, sensor
         self._push: PushConfig | None = world.push if world is not None else None
         if world is not None:
             _check(task, world)
         if sensor is not None:
-            sensors.check(sensor, task.blocks)
+            sensors.check(sensor, task.observed)
         super().__init__(task)
 
     @property
@@ -82,7 +79,9 @@ class Disturbed(Wrapper):
             saved += self._bind_world(world, self._world_config)
         self._sensors: Any = None
         if self._sensor_config is not None:
-            rules = sensors.rules(self._sensor_config, self.blocks, inner.observation)
+            # Tasks whose steps last longer than 1/30 s have a callback within steps.
+            long_steps = hasattr(self.task, 'watch')
+            rules = sensors.rules(self._sensor_config, self.observed, inner.observation, long_steps)
             self._sensors, self._sensor_state = packed(rules), rules.state
             self.outcome = Outcome(rules.state.observation, *inner[1:])
             self._info['clean_observation'] = inner.observation

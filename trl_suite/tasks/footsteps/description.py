@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from trl_suite.tasks.components import description, spatial_description
-from trl_suite.tasks.components.description import REWARD, span, tracking_terms
-from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
+from trl_suite.tasks.components.description import span
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, section
 
@@ -32,12 +31,7 @@ def planar_rules(spec: Any, task: Any) -> Iterator[Section]:
         f'steps {span(task.plans.length)} long, straight ahead; with probability {task.plans.change:g} '
         'the length is redrawn; right stance while the phase is below 0.5',
     )
-    yield section(
-        REWARD,
-        tracking_terms(task, True),
-        _SWING,
-        'heading: equal to its weight while the trunk points forwards, 0 while it points backwards',
-    )
+    yield description.reward(task, _SWING)
     yield description.fall(task, description.missed(task))
 
 
@@ -50,12 +44,7 @@ def spatial_rules(spec: Any, task: Any) -> Iterator[Section]:
         f'Period (two steps) {task.period:.4g} s; right stance while the phase is below 0.5',
     )
     yield section(_PLANS, '; '.join(_plans(task)))
-    yield section(
-        REWARD,
-        tracking_terms(task, True),
-        'heading: weight * ((1 + cos error) / 2)^4, error: angle between heading and planned heading',
-        _SWING,
-    )
+    yield description.reward(task, _SWING)
     yield description.fall(task, description.missed(task))
 
 
@@ -85,10 +74,5 @@ def _plans(task: Any) -> list[str]:
     return lines
 
 
-PLANAR = Description(
-    blocks=lambda task: PLANAR_BLOCKS, rules=planar_rules, after=after, legend=LEGEND
-)
-SPATIAL = Description(
-    blocks=spatial_description.blocks, rules=spatial_rules, after=spatial_description.after,
-    legend=LEGEND,
-)  # fmt: skip
+PLANAR = Description(rules=planar_rules, after=after, legend=LEGEND)
+SPATIAL = Description(rules=spatial_rules, after=spatial_description.after, legend=LEGEND)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,12 +19,20 @@ from trl_suite.kinematics.planar import has_fallen, measure
 from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
-from trl_suite.tasks.components.footstep_plan import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
+from trl_suite.tasks.components.footstep_plan import (
+    CONTACT,
+    PLAN,
+    SOLE,
+    SOLE_AHEAD,
+    STANCE_COLOUR,
+    SWING_COLOUR,
+)
 from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.components.plans import options as plans_from
 from trl_suite.tasks.imitation import planar_rules as imitation_rules
 from trl_suite.tasks.imitation.planar import PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
+from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import option
@@ -34,8 +41,11 @@ from trl_suite.util.random import Streams, random, uniform
 _DIGITS = (
     1e9  # the clock is rounded to 1 / _DIGITS of a cycle, so that stance switches at half a cycle
 )
-_END_EFFECTOR = list(rewards.STEP_TERMS).index('end_effector')
-_HEADING = list(rewards.STEP_TERMS).index('heading')
+HEADING = Term(
+    'heading',
+    rewards.HEADING_WEIGHT,
+    '1 while the trunk points forwards, 0 while it points backwards',
+)
 RIGHT, LEFT = 0, 1
 
 
@@ -62,14 +72,13 @@ class Plan(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Options of plans and of the reward, and columns of the observation.
+    """Options of plans and of the reward.
 
     Attributes:
       shortest, longest: bounds of the step length, m.
       change: probability that the step length is redrawn.
       max_landing_error: landing error above which the episode fails, m.
       footstep_scale: factor of the squared distance between swing foot and landing place.
-      contact_block, plan_block: first columns of these blocks.
     """
 
     shortest: float
@@ -77,8 +86,6 @@ class Options(NamedTuple):
     change: float
     max_landing_error: float
     footstep_scale: float
-    contact_block: int
-    plan_block: int
 
 
 # A step of simulation i, in order.
@@ -149,8 +156,8 @@ def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
 @compiled
 def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Writes the reward terms; in the second half of a step the plan replaces the clip."""
-    imitation_rules.compare(i, rules)
-    layout, measurement, terms = rules.layout, rules.measurement, rules.outcome.reward_terms
+    pose, velocity, _, com, height = imitation_rules.errors(i, rules)
+    columns, measurement = rules.features, rules.measurement
     phase, swing = rules.state.phase[i], 1 - plan.stance[i]
     twice = 2 * phase
     late = twice - np.floor(twice) > 0.5
@@ -158,19 +165,21 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
     for k in range(measurement.effectors.shape[1]):
         if k == swing and late:
             continue  # compared with the landing place below
-        off = measurement.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
+        off = measurement.effectors[i, k] - feature(phase, columns.effectors + k, rules.clip)
         end_effector += off * off
     if late:
         foot = rules.body.effectors[swing]
-        raised = feature(phase, layout.effectors + 2 + swing, rules.clip)
+        raised = feature(phase, columns.effectors + 2 + swing, rules.clip)
         x = plan.landing[i, 0, 0] - rules.physics.xpos[i, foot, 0]
         z = plan.landing[i, 0, 2] - rules.physics.xpos[i, foot, 2] + raised
         end_effector += options.footstep_scale * (x * x + z * z)
-    weights, scales = rules.term_weights, rules.term_scales
-    terms[i, _END_EFFECTOR] = rewards.term(
-        end_effector, weights[_END_EFFECTOR], scales[_END_EFFECTOR]
-    )
-    terms[i, _HEADING] = weights[_HEADING] if measurement.facing[i] > 0.0 else 0.0
+    terms, outcome = rules.terms, rules.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
+    give(i, 1.0 if measurement.facing[i] > 0.0 else 0.0, terms.heading, outcome)
 
 
 @compiled
@@ -178,15 +187,16 @@ def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
     """Writes the blocks after velocity: strain, phase, contact and plan."""
     imitation_rules.observe(i, rules)
     observation, body, physics = rules.outcome.observation, rules.body, rules.physics
+    columns = rules.columns
     for k in range(len(body.contact)):
         touches = physics.sensordata[i, body.contact[k]] > 0.0
-        observation[i, options.contact_block + k] = 1.0 if touches else 0.0
+        observation[i, columns.contact + k] = 1.0 if touches else 0.0
     for k in range(12):
-        observation[i, options.plan_block + k] = 0.0
+        observation[i, columns.plan + k] = 0.0
     for which in range(2):  # first and second landing place, relative to the foot that lands there
         foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
         x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
-        place = options.plan_block + 6 * which + 3 * foot
+        place = columns.plan + 6 * which + 3 * foot
         observation[i, place] = x * rules.measurement.facing[i]
         observation[i, place + 2] = plan.landing[i, which, 2] - rules.measurement.under[i]
 
@@ -270,9 +280,9 @@ class PlanarFootsteps(PlanarImitation):
       plan: the footsteps; see `Plan`.
     """
 
-    TERMS = rewards.STEP_TERMS
+    terms = *rewards.STEP_TERMS, HEADING
     ABOUT = 'root'
-    EXTRAS = MappingProxyType({'contact': 2, 'plan': 13})
+    EXTRAS = CONTACT, PLAN
 
     CONFIG: Any = PlanarFootstepsConfig
 
@@ -333,7 +343,7 @@ class PlanarFootsteps(PlanarImitation):
         plans = self.plans
         options = Options(
             plans.length[0], plans.length[1], plans.change, np.inf if self.max_landing_error is None else float(self.max_landing_error),
-            float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
+            float(self._footstep_scale),
         )  # fmt: skip
         self._packs = self._pack, packed(self.plan), packed(options)
 

@@ -7,7 +7,7 @@ deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,22 +18,18 @@ from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement
 from trl_suite.kinematics.spatial_reference import SpatialReference
 from trl_suite.motion import Steps, quaternion, step_features
-from trl_suite.tasks.components import rewards
-from trl_suite.tasks.components.comparison import (
-    comparison,
-)
+from trl_suite.tasks.components.comparison import comparison
 from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.components.footstep_plan import (
-    CONTACT_SIZE,
+    CONTACT,
     LEFT,
-    PLAN_SIZE,
+    PLAN,
     RIGHT,
     check_two_feet,
     footstep_plan,
     plan_markers,
-    plan_mirror,
 )
-from trl_suite.tasks.components.goals import GOAL_COLOUR, flag
+from trl_suite.tasks.components.goals import GOAL, GOAL_COLOUR, flag
 from trl_suite.tasks.components.plans import (
     FOOTSTEP_SCALE,
     MAX_LANDING_ERROR,
@@ -41,10 +37,10 @@ from trl_suite.tasks.components.plans import (
     Pushes,
     options,
 )
-from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP, act_all
 from trl_suite.tasks.footsteps.spatial_plans import Planner
 from trl_suite.tasks.footsteps.spatial_rules import (
+    TERMS,
     FootstepRules,
     FootstepState,
     finish_all,
@@ -52,11 +48,9 @@ from trl_suite.tasks.footsteps.spatial_rules import (
     observe_all,
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
-from trl_suite.tasks.task import Marker, consecutive
+from trl_suite.tasks.task import Marker
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
-
-HIDDEN = ('contact', 'plan')  # blocks that the option hidden_plan removes
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,7 +108,7 @@ class SpatialFootsteps(SpatialTask):
     second relative to the stance foot.
     """
 
-    TERMS = rewards.STEP_TERMS
+    terms = TERMS
     ABOUT = 'root'
 
     CONFIG: Any = SpatialFootstepsConfig
@@ -153,29 +147,11 @@ class SpatialFootsteps(SpatialTask):
         self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
         # Episodes start from the straight step whose length is nearest to the planned one.
         self._first = straight_step(steps, float(np.mean(self.plans.length)))
-        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * config.hidden_plan}
         super().__init__(
-            character, arena, steps, config, actuation_model=actuation_model, extras=extras
-        )
-        if config.hidden_plan:
-            self._hide_plan()
-
-    def _hide_plan(self) -> None:
-        """Removes contact and plan from the observation."""
-        names = [name for name in self._full if name not in HIDDEN]
-        self.blocks = consecutive({
-            name: self._full[name].stop - self._full[name].start for name in names
-        })  # fmt: skip
-        kept = self._kept = np.concatenate([np.r_[self._full[name]] for name in names])
-        if self.mirror is None:
-            return
-        place = np.zeros(len(self.mirror.observation_sign), int)
-        place[kept] = np.arange(len(kept))
-        self.mirror = dataclasses.replace(
-            self.mirror,
-            observation_index=place[self.mirror.observation_index[kept]],
-            observation_sign=self.mirror.observation_sign[kept],
-        )
+            character, arena, steps, config, actuation_model=actuation_model,
+            extras=(CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)),
+            hidden=('contact', 'plan') if config.hidden_plan else (),
+        )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
         return typical_poses(self.steps, self._first)
@@ -197,13 +173,17 @@ class SpatialFootsteps(SpatialTask):
             self.plans, self.arena, self.plan, self.state, self.clock, self._random,
             goals=self.goal_given, grace_steps=self._grace_steps,
         )  # fmt: skip
-        starts = {name: part.start for name, part in self._full.items()}
+        limit = self.max_landing_error
         rules = FootstepRules(
-            common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
-            starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
-            self._heading_scale,
-            np.inf if self.max_landing_error is None else float(self.max_landing_error),
-        )  # fmt: skip
+            common=common,
+            comparison=comparison(self.character, self.reference, self.terms),
+            plan=self.plan,
+            state=self.state,
+            columns=self._extra_columns(),
+            footstep_scales=self._footstep_scales,
+            heading_scale=self._heading_scale,
+            largest_miss=np.inf if limit is None else float(limit),
+        )
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
 
@@ -316,20 +296,7 @@ class SpatialFootsteps(SpatialTask):
             now[:, columns['root']], turned
         )
 
-    # Reflection and rendering.
-
-    def _extra_mirror(self, name: str) -> Reflection:
-        return (np.arange(2), np.array([-1.0, 1.0])) if name == 'goal' else plan_mirror(name)
-
-    def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
-        return {**extras, 'plan': 7}
-
-    def _canonical_extra_columns(self, name: str) -> np.ndarray:
-        columns = super()._canonical_extra_columns(name)
-        if name == 'contact':
-            return columns
-        # Heading; first landing place from the left foot, second from the right foot.
-        return columns[[12, 3, 4, 5, 6, 7, 8]]
+    # Rendering.
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places, the planned heading and the goal."""

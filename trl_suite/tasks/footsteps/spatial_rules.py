@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.kinematics.spatial import polar
 from trl_suite.kinematics.spatial_reference import feature, moment
-from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.comparison import (
     Comparison,
     com_error,
-    height_error,
-    pose_error,
-    rate_error,
-    term,
+    motion_errors,
 )
 from trl_suite.tasks.components.footstep_plan import (
     FootstepPlan,
     observe_plan,
     update_stance,
 )
+from trl_suite.tasks.components.rewards import HEADING_WEIGHT, STEP_TERMS
 from trl_suite.tasks.components.spatial_rules import (
     SpatialRules,
     breaks_down,
@@ -32,9 +29,16 @@ from trl_suite.tasks.components.spatial_rules import (
     tick,
 )
 from trl_suite.tasks.task import conclude
+from trl_suite.tasks.terms import Term, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, compiled_loop
 
-POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING = range(len(rewards.STEP_TERMS))
+TERMS = (
+    *STEP_TERMS,
+    Term(
+        'heading', HEADING_WEIGHT,
+        '((1 + cos error) / 2)^4, error: angle between heading and planned heading',
+    ),
+)  # fmt: skip
 
 
 class FootstepState(NamedTuple):
@@ -69,8 +73,8 @@ class FootstepRules(NamedTuple):
     """Data for the compiled functions of footsteps.
 
     Attributes:
-      contact, plan_block: first columns of these blocks in the full observation.
-      goal_block: first column of the block goal; -1: not observed.
+      columns: first columns of the blocks contact, plan and goal in the full observation; -1: not
+        observed.
       footstep_scales, heading_scale: factors of errors in the reward.
       largest_miss: landing error above which the episode fails, m.
     """
@@ -79,9 +83,7 @@ class FootstepRules(NamedTuple):
     comparison: Comparison
     plan: FootstepPlan
     state: FootstepState
-    contact: int
-    plan_block: int
-    goal_block: int
+    columns: Any
     footstep_scales: np.ndarray
     heading_scale: float
     largest_miss: float
@@ -127,18 +129,12 @@ def step_phase(phase: float) -> float:
 def compare(i: int, rules: FootstepRules) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
     common, plan, comparison = rules.common, rules.plan, rules.comparison
-    measurement, terms, state = common.measurement, common.outcome.reward_terms, rules.state
+    measurement, state, tracks = common.measurement, rules.state, comparison.tracks
     share = step_phase(common.clock.phase[i])
-    row, fraction = moment(share, state.track[i], comparison.tracks)
-    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
-    terms[i, VELOCITY] = term(
-        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
-    )
+    row, fraction = moment(share, state.track[i], tracks)
+    pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     # The reference was aligned with the heading of the character at the switch of stance.
-    terms[i, COM] = term(
-        COM, com_error(i, row, fraction, state.turned[i], comparison, measurement), comparison
-    )
-    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
+    com = com_error(i, row, fraction, state.turned[i], comparison, measurement)
 
     swing, late = 1 - plan.stance[i], share > 0.5
     feet = step = 0.0
@@ -146,26 +142,28 @@ def compare(i: int, rules: FootstepRules) -> None:
         for k in range(3):
             # In the second half, x and y of the swing foot are compared with the plan instead.
             if not (late and foot == swing and k < 2):
-                column = comparison.effectors + 3 * foot + k
-                off = measurement.features[i, column] - feature(
-                    row, fraction, column, comparison.tracks
-                )
+                column = comparison.columns.effectors + 3 * foot + k
+                off = measurement.features[i, column] - feature(row, fraction, column, tracks)
                 feet += off * off
     if late:
+        column = comparison.columns.effectors + 3 * swing + 2  # height of the swing foot
         for k in range(3):
             off = plan.landing[i, 0, k] - measurement.feet[i, swing, k]
             if k == 2:
-                off += feature(
-                    row, fraction, comparison.effectors + 3 * swing + 2, comparison.tracks
-                )
+                off += feature(row, fraction, column, tracks)
             step += off * off
+    terms, outcome = comparison.terms, common.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
     end = 0.0
     for scale in rules.footstep_scales:
-        end += term(END_EFFECTOR, feet + scale * step, comparison)
-    terms[i, END_EFFECTOR] = end / len(rules.footstep_scales)
-    off = abs(rewards.wrapped(plan.heading[i] - measurement.heading[i]))
-    facing = rewards.facing(min(rules.heading_scale * off, math.pi))
-    terms[i, HEADING] = comparison.term_weights[HEADING] * facing
+        score(i, feet + scale * step, terms.end_effector, outcome)
+        end += outcome.reward_terms[i, terms.end_effector.column]
+    outcome.reward_terms[i, terms.end_effector.column] = end / len(rules.footstep_scales)
+    off = abs(wrapped(plan.heading[i] - measurement.heading[i]))
+    give(i, facing(min(rules.heading_scale * off, math.pi)), terms.heading, outcome)
 
 
 @compiled
@@ -173,13 +171,13 @@ def observe(i: int, rules: FootstepRules) -> None:
     """Writes the observation."""
     common, measurement = rules.common, rules.common.measurement
     observe_body(i, common)
-    observe_plan(i, rules.contact, rules.plan_block, measurement, rules.plan, common.full)
-    if rules.goal_block >= 0:
+    columns = rules.columns
+    observe_plan(i, columns, measurement, rules.plan, common.full)
+    if columns.goal >= 0:
         x = rules.state.goal[i, 0] - measurement.root[i, 0]
         y = rules.state.goal[i, 1] - measurement.root[i, 1]
         bearing, distance = polar(i, x, y, measurement)
-        common.full[i, rules.goal_block] = bearing
-        common.full[i, rules.goal_block + 1] = distance
+        common.full[i, columns.goal], common.full[i, columns.goal + 1] = bearing, distance
     publish(i, common)
 
 

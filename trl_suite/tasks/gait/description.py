@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trl_suite.tasks.components import description
-from trl_suite.tasks.components.description import Meanings, floats
+from trl_suite.tasks.components.description import floats
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
 from trl_suite.tasks.task_type import Description
@@ -18,22 +18,6 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.registry.spec import EnvSpec
 
-_BLOCKS = {
-    'terrain': (
-        'm',
-        'ground heights from 0.5 m behind to 10 m ahead, relative to the ground under the root',
-    ),
-    'pose': (
-        'm',
-        'root height above the ground; then x, z of each other link centre from the root',
-    ),
-    'velocity': ('m/s', 'x, z velocity of each link centre'),
-}
-_STANCE_FIRST = '; the stance leg first, then the swing leg'
-_PITCH_ENDS = {
-    'pose': '; the last number is the pitch of the root (rad)',
-    'velocity': '; the last number is the pitch rate of the root (rad/s)',
-}
 # Units of gait parameters that are not angles, by name without state.
 _UNITS = {
     'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
@@ -57,15 +41,6 @@ _FROM_SPEED = {  # Cv: gain from the forward speed of the centre of mass
     True: 'gain from the forward speed to SwingHip, in Contact and Down',
     False: 'gain from the forward speed to Hip and Shoulder of a leg in the air',
 }
-
-
-def blocks(task: Any) -> Meanings:
-    """Returns units and meanings of the observation blocks."""
-    spec = task.character.spec
-    ends = _PITCH_ENDS if task.gait.parameters.observe_pitch else {}
-    if spec.mirror:
-        ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
-    return {name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _BLOCKS.items()}
 
 
 def before(task: Any) -> Iterator[Section]:
@@ -140,21 +115,12 @@ def _effect(task: Any, parameter: str) -> str:
 def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     """Yields the sections on reward and termination."""
     figure, parameters = task.character.spec, task.gait.parameters
-    weights = parameters.reward
-    weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
-    lines = [
-        f'{weight}exp(-{gait_rules.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
-        'v: mean forward speed of the centre of mass in the cycle, m/s',
-    ]
-    if weights['stumble']:
-        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait_rules.STUMBLE_SHARPNESS:g} s)'
-        lines.append(
-            's: fraction of time in which a link other than '
-            f'{", ".join(figure.stumble_exempt)} touches the ground'
-        )
+    notes = [f'target speed: {parameters.target_speed:g} m/s']
+    if parameters.reward['stumble']:
+        notes.append(f'links that may touch the ground: {", ".join(figure.stumble_exempt)}')
     if not parameters.backward_reward:
-        lines.append('0 if v is negative')
-    yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
+        notes.append('0 if the speed is negative')
+    yield description.reward(task, *notes, title='Reward of a cycle')
     links = ', '.join(figure.fall_links)
     share = gait_rules.FALL_THRESHOLD, gait_rules.CONTACT_DECAY, gait_rules.CONTACT_GAIN
     ends = [
@@ -195,6 +161,4 @@ def joints(task: Any) -> tuple[str, list[object]]:
     ]
 
 
-GAIT = Description(
-    blocks=blocks, rules=rules, before=before, action=action, time=time, joints=joints
-)
+GAIT = Description(rules=rules, before=before, action=action, time=time, joints=joints)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import CONTROL_TIMESTEP, gaits
 from trl_suite.controllers.machine import GaitRules, touches
+from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
+from trl_suite.kinematics.blocks import Block
 from trl_suite.kinematics.planar import (
     PlanarBody,
     PlanarMeasurement,
@@ -23,6 +27,7 @@ from trl_suite.tasks.task import (
     conclude,
     too_fast,
 )
+from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
@@ -47,11 +52,17 @@ PATIENCE, PROGRESS = (
 )  # s, m; an episode fails if the root moves less than this in this time
 MAX_JOINT_SPEED = 1000.0  # rad/s; high, since these joints have no damping
 
-# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 * stumbling time
-# fraction).
-SPEED_SHARPNESS, STUMBLE_SHARPNESS = 0.5, 10.0
-TERMS = ('speed', 'stumble')
-SPEED, STUMBLE = range(len(TERMS))
+STUMBLE_SHARPNESS = 10.0
+TERMS = (  # of the reward of a cycle; weights are those of the character
+    Term(
+        'speed', 0.8, 'mean forward speed of the centre of mass in the cycle minus the target speed, squared',
+        0.5, 'm^2/s^2',
+    ),
+    Term(
+        'stumble', 0.2, f'1 / (1 + {STUMBLE_SHARPNESS:g} s), s: fraction of time in which a link that should '
+        'not touches the ground',
+    ),
+)  # fmt: skip
 
 _FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
@@ -105,7 +116,6 @@ class Options(NamedTuple):
       forward_only: whether moving backwards is a fall.
       backward_reward: whether the reward of a cycle with negative speed can be positive.
       target_speed: m/s.
-      weights: weights of the reward terms, (2,).
       columns: columns of the measurement in the observation, by stance leg, (2, size).
       pitch, pitch_rate: columns of the observation for pitch and its rate; -1: not observed.
     """
@@ -122,7 +132,6 @@ class Options(NamedTuple):
     forward_only: bool
     backward_reward: bool
     target_speed: float
-    weights: np.ndarray
     columns: np.ndarray
     pitch: int
     pitch_rate: int
@@ -133,6 +142,7 @@ class Rules(NamedTuple):
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
+      terms: the reward terms.
       measured: blocks terrain, pose and velocity as `measure` writes them, (n, ...).
       interruption: why `go_on` returned last, (n,).
     """
@@ -143,6 +153,7 @@ class Rules(NamedTuple):
     gait: GaitRules
     ctrl: np.ndarray
     options: Options
+    terms: Any
     measured: np.ndarray
     interruption: np.ndarray
     measurement: PlanarMeasurement
@@ -287,15 +298,18 @@ def finish_step(i: int, rules: Rules) -> None:
 @compiled
 def reward(i: int, rules: Rules) -> None:
     """Writes the reward terms, from mean speed and stumbling time of the cycle."""
-    state, options, terms = rules.state, rules.options, rules.outcome.reward_terms
+    state, options, terms, outcome = rules.state, rules.options, rules.terms, rules.outcome
     travelled = rules.gait.physics.subtree_com[i, rules.body.links[0], 0] - state.start[i]
     speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
     off = speed - options.target_speed
     share = state.stumbled[i] / state.lasted[i]
-    terms[i, SPEED] = options.weights[SPEED] * math.exp(-SPEED_SHARPNESS * (off * off))
-    terms[i, STUMBLE] = options.weights[STUMBLE] / (1 + STUMBLE_SHARPNESS * share)
     if speed < 0.0 and not options.backward_reward:
-        terms[i, SPEED] = terms[i, STUMBLE] = 0.0
+        give(i, 0.0, terms.speed, outcome)
+        give(i, 0.0, terms.stumble, outcome)
+        return
+    score(i, off * off, terms.speed, outcome)
+    column = terms.stumble.column
+    outcome.reward_terms[i, column] = terms.stumble.weight / (1 + STUMBLE_SHARPNESS * share)
 
 
 @compiled
@@ -310,6 +324,26 @@ def observe(i: int, rules: Rules) -> None:
     if options.pitch >= 0:
         observation[i, options.pitch] = physics.qpos[i, body.qpos[2]]
         observation[i, options.pitch_rate] = physics.qvel[i, body.dof[2]]
+
+
+def observed_blocks(
+    measured: tuple[Block, ...], spec: CharacterSpec, parameters: Parameters
+) -> tuple[Block, ...]:
+    """Returns the blocks that `observe` writes, from those that `measure` writes."""
+    terrain, pose, velocity = measured
+    stance = '; the stance leg first, then the swing leg' if spec.mirror else ''
+    pitch = stance or '; the last number is the pitch of the root (rad)'
+    rate = stance or '; the last number is the pitch rate of the root (rad/s)'
+    return (
+        terrain,
+        dataclasses.replace(
+            pose, size=pose.size - 2, meaning='root height above the ground; then x, z of each other link '
+            f'centre from the root{pitch if parameters.observe_pitch else stance}',
+        ),
+        dataclasses.replace(
+            velocity, meaning=f'{velocity.meaning}{rate if parameters.observe_pitch else stance}'
+        ),
+    )  # fmt: skip
 
 
 @compiled

@@ -20,6 +20,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import layout
 from trl_suite.kinematics.planar import PlanarBody
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
@@ -40,6 +41,7 @@ from trl_suite.tasks.gait.rules import (
     begin_steps,
     finish_steps,
     observe_all,
+    observed_blocks,
     run,
 )
 from trl_suite.tasks.task import (
@@ -48,10 +50,9 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_simulated,
-    consecutive,
     drawn_seed,
-    outcome,
 )
+from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, option
@@ -154,10 +155,10 @@ class GaitTask(Task):
                 tuple(f'base_action_{i}' for i in range(count)), 'preference', '1',
                 np.zeros(count), np.ones(count),
             )  # fmt: skip
-        links = len(character.spec.links)
-        self.blocks = consecutive({
-            'terrain': SAMPLES, 'pose': 2 * links - 1, 'velocity': 2 * links,
-        })  # fmt: skip
+        self.observed = observed_blocks(self.figure.blocks, character.spec, parameters)
+        self.terms = tuple(
+            dataclasses.replace(term, weight=parameters.reward[term.name]) for term in TERMS
+        )
 
     @property
     def root_entity(self) -> PlanarArena:
@@ -174,10 +175,8 @@ class GaitTask(Task):
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure, gait = self.figure, self.gait
-        blocks = consecutive(figure.blocks)
-        figure.bind(world, blocks)
+        figure.bind(world, layout(figure.blocks))
         gait.bind(world)
-        parameters = gait.parameters
         options = self._options(figure.body)
         self.state = GaitTaskState(
             action=np.zeros((n, len(self.action_map))),
@@ -194,23 +193,28 @@ class GaitTask(Task):
             duration=np.zeros(n),
             stumbling=np.zeros(n),
         )
-        size = max(part.stop for part in self.blocks.values())
-        self.outcome = outcome(n, size, len(parameters.reward))
+        self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
         self.saved = (self.state, gait.state, self.outcome)
-        self.info_arrays = {
-            'reward_terms': dict(zip(parameters.reward, self.reward_terms.T, strict=True)),
+        self.info_arrays |= {
             'fell': self.state.fell,
             'stuck': self.state.stuck,
-            'diverged': self.outcome.diverged,
-            'distance': world.qpos[:, figure.pose_qpos[0]],
             'duration': self.state.duration,
             'stumbled': self.state.stumbling,
         }
         self.rules = Rules(
-            world.engine, figure.body, figure.ground, gait.rules, world.ctrl, options,
-            np.zeros((n, sum(figure.blocks.values()))), np.zeros(n, int), figure.empty_measurement(),
-            self.state, self.outcome,
-        )  # fmt: skip
+            engine=world.engine,
+            body=figure.body,
+            ground=figure.ground,
+            gait=gait.rules,
+            ctrl=world.ctrl,
+            options=options,
+            terms=terms_data(self.terms),
+            measured=np.zeros((n, sum(block.size for block in figure.blocks))),
+            interruption=np.zeros(n, int),
+            measurement=figure.empty_measurement(),
+            state=self.state,
+            outcome=self.outcome,
+        )
         self._pack = packed(self.rules)
         self._start = self._start_pose()
 
@@ -234,7 +238,6 @@ class GaitTask(Task):
             forward_only=parameters.forward_only,
             backward_reward=parameters.backward_reward,
             target_speed=float(parameters.target_speed),
-            weights=np.array([parameters.reward[name] for name in TERMS]),
             columns=self._columns(body),
             pitch=self.blocks['pose'].stop - 1 if pitch else -1,
             pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,

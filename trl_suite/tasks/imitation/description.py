@@ -6,35 +6,16 @@ from collections.abc import Iterator
 from typing import Any
 
 from trl_suite.tasks.components import description, spatial_description
-from trl_suite.tasks.components.description import PLAN_BLOCKS, REWARD, Meanings, tracking_terms
 from trl_suite.tasks.task_type import Description
-from trl_suite.util.tables import Section, section
-
-PLANAR_BLOCKS: Meanings = {
-    'terrain': (
-        'm',
-        'ground heights from 0.5 m behind to 3 m ahead, relative to the ground under the root',
-    ),
-    'pose': ('m', 'root height above the ground; then x, z of each link centre from the root'),
-    'velocity': ('m/s', 'x, z velocity of each link centre'),
-    'strain': ('1', 'strain of each muscle fibre'),
-    'phase': ('1', 'phase of the clip in [0, 1); then the one-hot of its quarter'),
-    'reference': (
-        'm, m/s',
-        'root height, link centres from the root, and velocities of link centres of the reference',
-    ),
-    **PLAN_BLOCKS,
-}
+from trl_suite.util.tables import Section
 
 
 def rules(spec: Any, task: Any) -> Iterator[Section]:
     """Yields the sections on clip, reward and termination."""
     yield description.clip(task)
-    yield section(REWARD, tracking_terms(task, False))
+    yield description.reward(task)
     yield description.fall(task)
 
 
-PLANAR = Description(blocks=lambda task: PLANAR_BLOCKS, rules=rules)
-SPATIAL = Description(
-    blocks=spatial_description.blocks, rules=rules, after=spatial_description.after
-)
+PLANAR = Description(rules=rules)
+SPATIAL = Description(rules=rules, after=spatial_description.after)

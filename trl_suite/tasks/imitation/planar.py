@@ -8,8 +8,7 @@ motion control' (Berseth et al. 2018).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,13 @@ from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import Block, by_name, columns
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import Reference
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.footstep_plan import CONTACT
 from trl_suite.tasks.imitation.planar_rules import (
-    _FEATURES,
     ACTION_OFFSETS,
     CONTROL_TIMESTEP,
     PHASE_BINS,
@@ -33,10 +33,10 @@ from trl_suite.tasks.imitation.planar_rules import (
     VIEW_AHEAD,
     VIEW_BEHIND,
     ImitationState,
-    Layout,
     Rules,
     apply_actions,
     finish_steps,
+    motion_blocks,
     observe_all,
 )
 from trl_suite.tasks.task import (
@@ -47,11 +47,10 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_position_options,
-    consecutive,
     drawn_seed,
-    outcome,
     start_phases,
 )
+from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, option
@@ -128,9 +127,9 @@ class PlanarImitation(Task):
         link velocities; 4N + 1.
     """
 
-    TERMS: Mapping[str, tuple[float, float]] = rewards.IMITATION_TERMS  # weight, scale of the error
+    terms = rewards.IMITATION_TERMS
     ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
-    EXTRAS: Mapping[str, int] = MappingProxyType({})  # sizes of the blocks of a subclass
+    EXTRAS: tuple[Block, ...] = ()  # the blocks of a subclass
 
     CONFIG: Any = PlanarImitationConfig
 
@@ -161,7 +160,7 @@ class PlanarImitation(Task):
         self._start_phase = start_phases(config.start_phase)
         self.figure = PlanarFigure(
             character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation,
-            'contact' in self.EXTRAS,
+            CONTACT in self.EXTRAS,
         )  # fmt: skip
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
 
@@ -180,15 +179,9 @@ class PlanarImitation(Task):
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
-        reference = 4 * len(character.spec.links) + 1
         seen = getattr(config, 'reference_observation', False)
-        self.blocks = consecutive({
-            **self.figure.blocks,
-            'strain': len(muscles),
-            'phase': 0 if seen else 1 + PHASE_BINS,
-            'reference': reference if seen else 0,
-            **self.EXTRAS,
-        })  # fmt: skip
+        own = motion_blocks(len(muscles), len(character.spec.links), seen)
+        self.observed = *self.figure.blocks, *own, *self.EXTRAS
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
         self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])
 
@@ -209,34 +202,30 @@ class PlanarImitation(Task):
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
         )  # fmt: skip
         self.state = ImitationState(*np.zeros((3, n)))
-        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), len(self.TERMS))
+        self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
         self.saved = (self.state, self.outcome)
-        self.info_arrays = {
-            'reward_terms': dict(zip(self.TERMS, self.reward_terms.T, strict=True)),
-            'fell': self.outcome.fell,
-            'diverged': self.outcome.diverged,
-            'distance': world.qpos[:, figure.pose_qpos[0]],
-        }
         self._measurement = figure.empty_measurement()
-        terms = np.array(list(self.TERMS.values()))
         self.rules = Rules(
-            world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
-            drive, world.ctrl, self._layout(), np.asarray(spec.weights), terms[:, 0].copy(), terms[:, 1].copy(),
-            self._rest, self._scale, self._measurement, self.state, self.outcome,
-        )  # fmt: skip
-        self._pack = packed(self.rules)
-
-    def _layout(self) -> Layout:
-        columns = {name: part.start for name, part in self.reference.columns.items()}
-        starts = {name: part.start for name, part in self.blocks.items()}
-        reference = self.blocks.get('reference', slice(0, 0))
-        return Layout(
-            **{name: columns[name] for name in _FEATURES},
-            strain_block=starts.get('strain', -1),
-            phase_block=starts.get('phase', -1),
-            reference_block=starts.get('reference', -1),
-            reference=reference.stop - reference.start,
+            engine=world.engine,
+            body=figure.body,
+            physics=figure.state,
+            ground=figure.ground,
+            clip=self.reference.clip_table,
+            drive=drive,
+            ctrl=world.ctrl,
+            features=by_name(
+                'Features', {name: part.start for name, part in self.reference.columns.items()}
+            ),
+            columns=columns(self.observed, self.blocks),
+            terms=terms_data(self.terms),
+            weights=np.asarray(spec.weights),
+            rest=self._rest,
+            scale=self._scale,
+            measurement=self._measurement,
+            state=self.state,
+            outcome=self.outcome,
         )
+        self._pack = packed(self.rules)
 
     @property
     def phase(self) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.engine import native
+from trl_suite.kinematics.blocks import CLOCK, Block, Noise
 from trl_suite.kinematics.planar import (
     PlanarBody,
     PlanarMeasurement,
@@ -18,7 +19,7 @@ from trl_suite.kinematics.planar import (
     measure,
 )
 from trl_suite.kinematics.planar_reference import ClipTable, feature
-from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.rewards import COM_ERROR_FACTOR
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -26,6 +27,7 @@ from trl_suite.tasks.task import (
     conclude,
     too_fast,
 )
+from trl_suite.tasks.terms import score, wrapped
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
@@ -35,8 +37,6 @@ VIEW_BEHIND = 0.5  # m; terrain samples begin this far behind the root
 VIEW_AHEAD = 3.0  # m; they end this far ahead of it
 PHASE_BINS = 4
 ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
-
-POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
 
 class ImitationState(NamedTuple):
@@ -53,40 +53,15 @@ class ImitationState(NamedTuple):
     start: np.ndarray
 
 
-class Layout(NamedTuple):
-    """First columns of features in the clip's table, and of blocks in the observation.
-
-    Attributes:
-      angles, rates, effectors, com_velocity, height, positions, phase: first column of each
-        feature in the clip's table.
-      strain_block, phase_block, reference_block: first column of each block in the observation,
-        -1 if the block is not observed.
-      reference: number of columns of the reference block.
-    """
-
-    angles: int
-    rates: int
-    effectors: int
-    com_velocity: int
-    height: int
-    positions: int
-    phase: int
-    strain_block: int
-    phase_block: int
-    reference_block: int
-    reference: int
-
-
-_FEATURES = Layout._fields[:7]  # fields that are columns of the clip's table
-
-
 class Rules(NamedTuple):
     """Data of the compiled functions of imitation.
 
     Attributes:
       ctrl: controls of the physics, (n, controls).
+      features: first column of each feature in the clip's table.
+      columns: first column of each block in the observation.
+      terms: the reward terms.
       weights: weights of pitch and joints in the pose and velocity errors, (1 + J,).
-      term_weights, term_scales: weights and error scales of the reward terms, (5,).
       rest: tendon length of each muscle at zero strain, m.
       scale: change of tendon length of each muscle per unit of strain, m.
     """
@@ -98,10 +73,10 @@ class Rules(NamedTuple):
     clip: ClipTable
     drive: Drive
     ctrl: np.ndarray
-    layout: Layout
+    features: Any
+    columns: Any
+    terms: Any
     weights: np.ndarray
-    term_weights: np.ndarray
-    term_scales: np.ndarray
     rest: np.ndarray
     scale: np.ndarray
     measurement: PlanarMeasurement
@@ -148,50 +123,73 @@ def breaks_down(i: int, rules: Rules) -> bool:
 
 
 @compiled
-def compare(i: int, rules: Rules) -> None:
-    """Writes the reward terms, from errors of pose, velocities and end effectors."""
-    body, physics, clip, layout = rules.body, rules.physics, rules.clip, rules.layout
-    phase, measurement, terms = rules.state.phase[i], rules.measurement, rules.outcome.reward_terms
+def errors(i: int, rules: Rules) -> tuple[float, float, float, float, float]:
+    """Returns the errors of pose, velocity, end effectors, centre of mass and height of the root."""
+    body, physics, clip, columns = rules.body, rules.physics, rules.clip, rules.features
+    phase, measurement = rules.state.phase[i], rules.measurement
     pose = velocity = 0.0
     for k in range(len(rules.weights)):  # pitch, then joints
-        angle = physics.qpos[i, body.qpos[2 + k]] - feature(phase, layout.angles + k, clip)
+        angle = physics.qpos[i, body.qpos[2 + k]] - feature(phase, columns.angles + k, clip)
         if k == 0:
-            angle = rewards.wrapped(angle)
-        rate = physics.qvel[i, body.dof[2 + k]] - feature(phase, layout.rates + k, clip)
+            angle = wrapped(angle)
+        rate = physics.qvel[i, body.dof[2 + k]] - feature(phase, columns.rates + k, clip)
         pose += rules.weights[k] * (angle * angle)
         velocity += rules.weights[k] * (rate * rate)
     end_effector, count = 0.0, measurement.effectors.shape[1]
     for k in range(count):
-        off = measurement.effectors[i, k] - feature(phase, layout.effectors + k, clip)
+        off = measurement.effectors[i, k] - feature(phase, columns.effectors + k, clip)
         end_effector += off * off
     com = 0.0
     for k in range(2):
-        off = measurement.com_velocity[i, k] - feature(phase, layout.com_velocity + k, clip)
-        com += rewards.COM_ERROR_FACTOR * (off * off)
-    height = measurement.height[i] - feature(phase, layout.height, clip)
+        off = measurement.com_velocity[i, k] - feature(phase, columns.com_velocity + k, clip)
+        com += COM_ERROR_FACTOR * (off * off)
+    height = measurement.height[i] - feature(phase, columns.height, clip)
+    return pose, velocity, end_effector / (count // 2), com, height * height
 
-    weights, scales = rules.term_weights, rules.term_scales
-    terms[i, POSE] = rewards.term(pose, weights[POSE], scales[POSE])
-    terms[i, VELOCITY] = rewards.term(velocity, weights[VELOCITY], scales[VELOCITY])
-    end_effector /= count // 2
-    terms[i, END_EFFECTOR] = rewards.term(end_effector, weights[END_EFFECTOR], scales[END_EFFECTOR])
-    terms[i, COM] = rewards.term(com, weights[COM], scales[COM])
-    terms[i, ROOT] = rewards.term(height * height, weights[ROOT], scales[ROOT])
+
+@compiled
+def compare(i: int, rules: Rules) -> None:
+    """Writes the reward terms."""
+    pose, velocity, end_effector, com, height = errors(i, rules)
+    terms, outcome = rules.terms, rules.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
 
 
 @compiled
 def observe(i: int, rules: Rules) -> None:
     """Writes the blocks after terrain, pose and velocity: strain, and phase or reference."""
-    layout, clip, observation = rules.layout, rules.clip, rules.outcome.observation
+    columns, features, observation = rules.columns, rules.features, rules.outcome.observation
     phase = rules.state.phase[i]
     for k in range(len(rules.rest)):
         length = rules.physics.ten_length[i, k] - rules.rest[k]
-        observation[i, layout.strain_block + k] = length / rules.scale[k]
-    if layout.phase_block >= 0:
+        observation[i, columns.strain + k] = length / rules.scale[k]
+    if columns.phase >= 0:
         for k in range(1 + PHASE_BINS):
-            observation[i, layout.phase_block + k] = feature(phase, layout.phase + k, clip)
-    for k in range(layout.reference):
-        observation[i, layout.reference_block + k] = feature(phase, layout.height + k, clip)
+            observation[i, columns.phase + k] = feature(phase, features.phase + k, rules.clip)
+    if columns.reference >= 0:  # height, positions and velocities
+        for k in range(features.root_rate - features.height):
+            value = feature(phase, features.height + k, rules.clip)
+            observation[i, columns.reference + k] = value
+
+
+def motion_blocks(muscles: int, links: int, reference: bool) -> tuple[Block, ...]:
+    """Returns the blocks that `observe` writes; `reference`: instead of the phase."""
+    return (
+        Block('strain', muscles, '1', 'strain of each muscle fibre', Noise((0.003, 0.01, 0.02))),
+        Block(
+            'phase', 0 if reference else 1 + PHASE_BINS, '1',
+            'phase of the clip in [0, 1); then the one-hot of its quarter', CLOCK,
+        ),
+        Block(
+            'reference', 4 * links + 1 if reference else 0, 'm, m/s',
+            'root height, link centres from the root, and velocities of link centres of the reference',
+            'the reference is known to the controller',
+        ),
+    )  # fmt: skip
 
 
 # Loops over simulations. `rules` is passed as one pointer (`trl_suite.util.pack`).

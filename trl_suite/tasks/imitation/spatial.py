@@ -14,6 +14,7 @@ import numpy as np
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import Block
 from trl_suite.kinematics.spatial import polar
 from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
 from trl_suite.motion import Clip, quaternion
@@ -23,12 +24,9 @@ from trl_suite.tasks.components.comparison import (
     com_error,
     comparison,
     effector_error,
-    height_error,
-    pose_error,
-    rate_error,
-    term,
+    motion_errors,
 )
-from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.goals import GOAL
 from trl_suite.tasks.components.spatial_rules import (
     SpatialRules,
     act_all,
@@ -40,6 +38,7 @@ from trl_suite.tasks.components.spatial_rules import (
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
 from trl_suite.tasks.task import conclude, drawn_seed
+from trl_suite.tasks.terms import score
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import option
@@ -49,23 +48,17 @@ GOAL_AHEAD = (
 )
 TYPICAL_POSES = 256  # poses of a cycle; their mean is action 0 of position control
 
-POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
-
 
 class ImitationRules(NamedTuple):
     """Data for the compiled functions of imitation.
 
     Attributes:
-      reference: first column of the block reference in the full observation; -1: not observed.
-      goal: first column of the block goal.
-      links: number of links.
+      columns: first columns of the blocks reference and goal in the full observation.
     """
 
     common: SpatialRules
     comparison: Comparison
-    reference: int
-    goal: int
-    links: int
+    columns: Any
 
 
 # A step of simulation i, in order.
@@ -98,35 +91,49 @@ def compare(i: int, rules: ImitationRules) -> None:
     """Writes the reward terms, from errors of pose, velocities and end effectors."""
     comparison, measurement = rules.comparison, rules.common.measurement
     row, fraction = moment(rules.common.clock.phase[i], 0, comparison.tracks)
-    terms = rules.common.outcome.reward_terms
-    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
-    terms[i, VELOCITY] = term(
-        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
-    )
-    terms[i, END_EFFECTOR] = term(
-        END_EFFECTOR, effector_error(i, row, fraction, comparison, measurement), comparison
-    )
-    terms[i, COM] = term(COM, com_error(i, row, fraction, 0.0, comparison, measurement), comparison)
-    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
+    pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
+    end_effector = effector_error(i, row, fraction, comparison, measurement)
+    com = com_error(i, row, fraction, 0.0, comparison, measurement)
+    terms, outcome = comparison.terms, rules.common.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
 
 
 @compiled
 def observe(i: int, rules: ImitationRules) -> None:
     """Writes the observation."""
-    common, comparison = rules.common, rules.comparison
+    common, columns, full = rules.common, rules.columns, rules.common.full
     observe_body(i, common)
-    if rules.reference >= 0:
-        row, fraction = moment(common.clock.phase[i], 0, comparison.tracks)
-        common.full[i, rules.reference] = feature(
-            row, fraction, comparison.height, comparison.tracks
-        )
-        for k in range(6 * rules.links):  # positions and velocities of the links
-            value = feature(row, fraction, comparison.positions + k, comparison.tracks)
-            common.full[i, rules.reference + 1 + k] = value
+    if columns.reference >= 0:
+        tracks, features = rules.comparison.tracks, rules.comparison.columns
+        row, fraction = moment(common.clock.phase[i], 0, tracks)
+        full[i, columns.reference] = feature(row, fraction, features.height, tracks)
+        for k in range(6 * len(common.body.links)):  # positions and velocities of the links
+            value = feature(row, fraction, features.positions + k, tracks)
+            full[i, columns.reference + 1 + k] = value
     aside = common.travel.origin[i, 1] - common.measurement.root[i, 1]
-    bearing, distance = polar(i, GOAL_AHEAD, aside, common.measurement)
-    common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
+    full[i, columns.goal], full[i, columns.goal + 1] = polar(
+        i, GOAL_AHEAD, aside, common.measurement
+    )
     publish(i, common)
+
+
+def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
+    """Returns the blocks that `observe` writes after those of the body."""
+    return (
+        Block(
+            'reference', 1 + 6 * links if reference else 0, 'm, m/s',
+            'root height, link centres from the root, and velocities of link centres of the reference',
+            'the reference is known to the controller',
+        ),
+        dataclasses.replace(
+            GOAL, meaning='bearing (positive to the left) and distance of the point 3 m ahead on the line '
+            'along +x through the start',
+        ),
+    )  # fmt: skip
 
 
 # Loops over simulations; they take packs.
@@ -177,7 +184,7 @@ class SpatialImitation(SpatialTask):
     then has the phase of the single step and the one-hot of its half.
     """
 
-    TERMS = rewards.IMITATION_TERMS
+    terms = rewards.IMITATION_TERMS
 
     CONFIG: Any = SpatialImitationConfig
 
@@ -205,7 +212,7 @@ class SpatialImitation(SpatialTask):
         check_cycle(clip)
         self.clip, self.period = clip, clip.duration
         seen = config.reference_observation
-        extras = {'reference': 1 + 6 * len(character.spec.links) if seen else 0, 'goal': 2}
+        extras = motion_blocks(len(character.spec.links), seen)
         super().__init__(
             character, arena, clip, config, actuation_model=actuation_model, phase=not seen,
             extras=extras,
@@ -214,18 +221,12 @@ class SpatialImitation(SpatialTask):
     def _typical_poses(self) -> np.ndarray:
         return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
 
-    def _extra_mirror(self, name: str) -> Reflection:
-        assert name == 'goal', name  # mirrored observations have no reference
-        return np.arange(2), np.array([-1.0, 1.0])
-
     def bind(self, world: World) -> None:
         common = self._bind_rules(world)
         self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
-        starts = {name: part.start for name, part in self._full.items()}
         rules = ImitationRules(
-            common, comparison(self.character, self.reference, self.TERMS),
-            starts.get('reference', -1), starts['goal'], len(self.character.spec.links),
-        )  # fmt: skip
+            common, comparison(self.character, self.reference, self.terms), self._extra_columns()
+        )
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
 
     def _start(

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from trl_suite.tasks.components import ball, description, spatial_description
-from trl_suite.tasks.components.description import REWARD, Meanings, floats, tracking_terms
+from trl_suite.tasks.components.description import floats
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
 from trl_suite.tasks.navigation import direct, direct_rules, hierarchical_rules
 from trl_suite.tasks.task_type import Description
@@ -17,16 +17,6 @@ if TYPE_CHECKING:
     from trl_suite.registry.spec import EnvSpec
 
 _BEADS = ' Yellow spheres: past positions of the centre of mass; red: the goal.'
-_BLOCKS: Meanings = {
-    'surface': (
-        'm/s',
-        'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
-        'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then '
-        'all components to the right',
-    ),
-    'ball': spatial_description.BALL_BLOCK,
-    'low_level': ('', 'observation of the footstep controller'),
-}
 _MEANINGS = {
     'first_x': 'm; landing place of the swing foot, ahead of the root',
     'first_y': 'm; landing place of the swing foot, to the left of the root',
@@ -34,15 +24,6 @@ _MEANINGS = {
     'second_y': 'm; next landing place of the stance foot, to the left of the root',
     'turn': 'rad; planned heading relative to the current one, positive to the left',
 }
-
-
-def blocks(task: Any) -> Meanings:
-    """Returns units and meanings of the observation blocks."""
-    return {
-        **spatial_description.BLOCKS,
-        **_BLOCKS,
-        'goal': spatial_description.TARGETS['ball' in task.blocks],
-    }
 
 
 def action(environment: Environment) -> Section:
@@ -78,26 +59,11 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
     yield spatial_description.start(spec)
     if task.ball:
         yield spatial_description.goal_and_ball(task.config.goal_distance)
-        formulas, full = spatial_description.ball_terms(task.config.target_speed, task.goal_reached)
+        full = _full_with_ball(task)
     else:
         yield spatial_description.goal(spec, task, 'far')
-        formulas = [
-            f'exp(-{hierarchical_rules.SPEED_SHARPNESS:g} min(0, v - {task.config.target_speed:g})^2), v: speed of the '
-            'centre of mass towards the goal, m/s',
-            '1',
-        ]
         full = f'the term speed is at its maximum if the step begins within {task.goal_reached:g} m of the goal'
-    yield section(
-        'Reward of a step: sum of weight * term, at most 1; 0 after a fall',
-        Table(
-            ('name', 'weight', 'term'),
-            [
-                (name, weight, formula)
-                for (name, (weight, _)), formula in zip(task.TERMS.items(), formulas, strict=True)
-            ],
-        ),
-        full,
-    )
+    yield description.reward(task, f'target speed: {task.config.target_speed:g} m/s', full)
     every = hierarchical_rules.SAMPLE_FRAMES / 30
     share = (
         hierarchical_rules.FALL_THRESHOLD,
@@ -135,37 +101,30 @@ def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
         yield spatial_description.goal_and_ball()
     else:
         yield spatial_description.goal(spec, task, 'near')
-    yield section(REWARD, *_direct_reward(task, 'ball' if of_ball else 'goal'))
+    where = 'ball' if of_ball else 'goal'
+    notes = [
+        f"com: the clip's velocity is rotated towards the {where}; within {direct_rules.NEAR:g} m of it, com and "
+        'heading are equal to their weights'
+    ]
+    if of_ball:
+        notes += [f'target speed: {ball.SPEED:g} m/s', _full_with_ball(task)]
+    yield description.reward(task, *notes)
     yield description.fall(task)
 
 
-def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
-    near = f'{direct_rules.NEAR:g} m'
-    yield tracking_terms(task, False, proximity=f'distance to the {where}, in units of {near}')
-    yield (
-        'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and the direction of '
-        f'the {where}'
+def _full_with_ball(task: Any) -> str:
+    """Returns when all terms for a ball reach their maximum."""
+    return (
+        f'all terms for the ball are at their maximum while it is within {task.goal_reached:g} m of the goal '
+        f'and within {ball.NEAR:g} m of the walker'
     )
-    yield (
-        f"com: the clip's velocity is rotated towards the {where}; within {near} of it, com and heading are "
-        'equal to their weights'
-    )
-    if where == 'ball':
-        formulas, full = spatial_description.ball_terms(ball.SPEED, task.goal_reached)
-        weights = [task.TERMS[name][0] for name in task.TERMS if name in ball.SOCCER_TERMS]
-        yield Table(
-            ('term', 'weight', 'factor'),
-            list(zip(ball.SOCCER_TERMS, weights, formulas, strict=True)),
-        )
-        yield full
 
 
 DIRECT = Description(
-    blocks=spatial_description.blocks, rules=about_joints, after=spatial_description.after,
-    legend=_BEADS,
+    rules=about_joints, after=spatial_description.after, legend=_BEADS,
 )  # fmt: skip
 HIERARCHICAL = Description(
-    blocks=blocks, rules=about_plans, after=spatial_description.after, action=action,
+    rules=about_plans, after=spatial_description.after, action=action,
     time=time, joints=lambda task: ('', [''] * len(task.character.spec.joints)),
     legend=LEGEND + _BEADS,
 )  # fmt: skip

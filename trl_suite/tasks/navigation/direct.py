@@ -17,26 +17,30 @@ from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial_reference import SpatialReference
 from trl_suite.motion import Clip, Steps
-from trl_suite.tasks.components import ball, rewards
-from trl_suite.tasks.components.ball import MIRRORED as MIRRORED_BALL
-from trl_suite.tasks.components.ball import Ball
-from trl_suite.tasks.components.comparison import (
-    comparison,
+from trl_suite.tasks.components.ball import (
+    BALL,
+    BALL_GOAL,
+    SPEED,
+    Ball,
+    goal_disc,
+    no_ball,
+    soccer_terms,
 )
+from trl_suite.tasks.components.comparison import comparison
 from trl_suite.tasks.components.goal_drawer import GoalDrawer
-from trl_suite.tasks.components.goals import flag, goals
-from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.goals import GOAL, flag, goals
 from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, act_all
 from trl_suite.tasks.components.trace import trace, trace_markers
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
 from trl_suite.tasks.navigation.direct_rules import (
-    BALL_TERMS,
+    BALL_SHARE,
     GOAL_REACHED,
     HIDDEN_LENGTH,
     REWARDS,
     DirectRules,
     Progress,
+    direct_terms,
     finish_all,
     observe_all,
     travel_all,
@@ -80,14 +84,14 @@ class DirectNavigation(SpatialTask):
     """A spatial character imitates a clip while it walks, or dribbles a ball, from goal to goal.
 
     The reward is that of imitation, with the clip's velocity rotated towards the goal, and
-    additional terms for heading towards the goal and for proximity (`rewards.DIRECT_TERMS`). With a
+    additional terms for heading towards the goal and for proximity (`direct_terms`). With a
     ball, half of the reward has these terms, with the ball as the goal, and half is for dribbling
-    (`ball.SOCCER_TERMS`).
+    (`ball.soccer_terms`).
 
     Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
       goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball,
         measured from the ball.
-      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+      ball: with a ball, see `trl_suite.tasks.components.ball.BALL`; 9.
     """
 
     CONFIG: Any = DirectConfig
@@ -117,21 +121,19 @@ class DirectNavigation(SpatialTask):
         """
         check_cycle(clip)
         self.clip, self.period, self.ball = clip, clip.duration, ball
-        self.TERMS = BALL_TERMS if ball else rewards.DIRECT_TERMS
+        self.terms = direct_terms(1.0, 'goal')
+        if ball:
+            self.terms = *direct_terms(1 - BALL_SHARE, 'ball'), *soccer_terms(BALL_SHARE)
         reached = config.goal_reached
         self.goal_reached = GOAL_REACHED if reached is None else float(reached)
         self._goal_drawer = GoalDrawer(arena, ball, 'near')
         super().__init__(
             character, arena, clip, config, actuation_model=actuation_model,
-            extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
+            extras=(BALL_GOAL if ball else GOAL, BALL.observed_if(ball is not None)),
         )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
         return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
-
-    def _extra_mirror(self, name: str) -> Reflection:
-        signs = MIRRORED_BALL if name == 'ball' else (-1.0, 1.0)
-        return np.arange(len(signs)), np.array(signs)
 
     def bind(self, world: World) -> None:
         common, n = self._bind_rules(world), world.n
@@ -140,18 +142,23 @@ class DirectNavigation(SpatialTask):
         self.saved = (*self.saved, self.goals, self.progress, self.trace)
         self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
         self._goal_drawer.bind(world, self.goals, self.clock, self._random)
-        starts = {name: part.start for name, part in self._full.items()}
-        balls = ball.no_ball(n)
+        balls = no_ball(n)
         if self.ball:
             self.ball.bind(world)
-            balls = self.ball.rules(starts['ball'], ball.SPEED, self.goal_reached)
+            balls = self.ball.rules(SPEED, self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         rules = DirectRules(
-            common, comparison(self.character, self.reference, rewards.DIRECT_TERMS), self.goals,
-            self.progress, self.trace, starts['goal'], self.goal_reached,
-            self.ball is not None, balls,
-        )  # fmt: skip
+            common=common,
+            comparison=comparison(self.character, self.reference, self.terms),
+            goals=self.goals,
+            progress=self.progress,
+            trace=self.trace,
+            columns=self._extra_columns(),
+            goal_reached=self.goal_reached,
+            with_ball=self.ball is not None,
+            ball=balls,
+        )
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
 
     @property
@@ -198,7 +205,7 @@ class DirectNavigation(SpatialTask):
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of past positions of the centre of mass, and of the goal."""
         goal = self.goal[env_id]
-        there = ball.goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
+        there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [*trace_markers(env_id, self.trace), there]
 
 

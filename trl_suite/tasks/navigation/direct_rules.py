@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.kinematics.spatial import polar
 from trl_suite.kinematics.spatial_reference import moment
-from trl_suite.tasks.components import ball, rewards
 from trl_suite.tasks.components.ball import BallRules, dribble, observe_ball, remember
 from trl_suite.tasks.components.comparison import (
     Comparison,
     com_error,
     effector_error,
-    height_error,
-    pose_error,
-    rate_error,
-    term,
+    motion_errors,
 )
 from trl_suite.tasks.components.goals import Goals
+from trl_suite.tasks.components.rewards import tracking_terms
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
     SpatialRules,
@@ -32,6 +29,7 @@ from trl_suite.tasks.components.spatial_rules import (
 )
 from trl_suite.tasks.components.trace import Trace, follow
 from trl_suite.tasks.task import conclude
+from trl_suite.tasks.terms import Term, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, compiled_loop
 
 REWARDS = ('goal', 'original')
@@ -39,13 +37,27 @@ GOAL_REACHED = 0.5  # m; horizontal distance of the root within which a goal is 
 NEAR = 3.0  # m; distance from the goal within which com and heading have no error
 HIDDEN_LENGTH = 0.4  # m; step length of the plan of the reward 'original'
 BALL_SHARE = 0.5  # share of the reward for dribbling, with a ball
-BALL_TERMS = {
-    name: (BALL_SHARE * weight, scale)
-    for name, (weight, scale) in {**rewards.DIRECT_TERMS, **ball.SOCCER_TERMS}.items()
-}
 
-TERMS = len(rewards.DIRECT_TERMS)
-POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING, PROXIMITY = range(TERMS)
+
+def direct_terms(share: float, where: str) -> tuple[Term, ...]:
+    """Returns the terms of imitation on the way to a goal or a ball, whose weights sum to `share`.
+
+    Source: the original's scenario with a goal. The clip's velocity is rotated towards `where`.
+    """
+    return (
+        *tracking_terms(
+            'the centre of mass', 'mean', pose=(share * 0.5 / 1.15, 2.0),
+            velocity=(share * 0.05 / 1.15, 0.005), end_effector=(share * 0.15 / 1.15, 40.0),
+            com=(share * 0.2 / 1.15, 10.0), root=(share * 0.1 / 1.15, 10.0),
+        ),
+        Term(
+            'heading', share * 0.05 / 1.15,
+            f'((1 + cos error) / 2)^4, error: angle between the heading and the direction of the {where}',
+        ),
+        Term(
+            'proximity', share * 0.1 / 1.15, f'distance to the {where}, in units of {NEAR:g} m', 4.0, '1',
+        ),
+    )  # fmt: skip
 
 
 class Progress(NamedTuple):
@@ -58,7 +70,7 @@ class DirectRules(NamedTuple):
     """Data for the compiled functions of direct navigation.
 
     Attributes:
-      goal: first column of the block goal in the full observation.
+      columns: first columns of the blocks goal and ball in the full observation; -1: not observed.
       goal_reached: distance of the root within which the goal is reached, m.
       with_ball: whether the goal is that of a ball.
     """
@@ -68,7 +80,7 @@ class DirectRules(NamedTuple):
     goals: Goals
     progress: Progress
     trace: Trace
-    goal: int
+    columns: Any
     goal_reached: float
     with_ball: bool
     ball: BallRules
@@ -90,9 +102,14 @@ def travel(i: int, rules: DirectRules) -> bool:
     follow(i, count, measurement.com, rules.trace)
     if rules.with_ball:
         dribble(
-            i, TERMS, BALL_SHARE, CONTROL_TIMESTEP, goals.place, common.physics, measurement, rules.ball,
-            common.outcome.reward_terms,
-        )  # fmt: skip
+            i,
+            CONTROL_TIMESTEP,
+            goals.place,
+            common.physics,
+            measurement,
+            rules.ball,
+            common.outcome,
+        )
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
         goals.wanted[i] = count >= goals.due[i]  # a ball's goal is not redrawn when it is reached
@@ -135,23 +152,17 @@ def compare(i: int, rules: DirectRules) -> None:
     distance, direction = math.sqrt(squared), math.atan2(y, x)
     near = distance < NEAR
     com = 0.0 if near else com_error(i, row, fraction, direction, comparison, measurement)
-    off = 0.0 if near else rewards.wrapped(direction - measurement.heading[i])
-
-    terms = common.outcome.reward_terms
-    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
-    terms[i, VELOCITY] = term(
-        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
-    )
-    terms[i, END_EFFECTOR] = term(
-        END_EFFECTOR, effector_error(i, row, fraction, comparison, measurement), comparison
-    )
-    terms[i, COM] = term(COM, com, comparison)
-    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
-    terms[i, HEADING] = comparison.term_weights[HEADING] * rewards.facing(off)
-    terms[i, PROXIMITY] = term(PROXIMITY, squared / (NEAR * NEAR), comparison)
-    if rules.with_ball:
-        for k in range(TERMS):
-            terms[i, k] *= 1.0 - BALL_SHARE
+    off = 0.0 if near else wrapped(direction - measurement.heading[i])
+    pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
+    end_effector = effector_error(i, row, fraction, comparison, measurement)
+    terms, outcome = comparison.terms, common.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
+    give(i, facing(off), terms.heading, outcome)
+    score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
     along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
     rules.progress.speed[i] = along / max(distance, 1e-9)
 
@@ -161,16 +172,15 @@ def observe(i: int, rules: DirectRules) -> None:
     """Writes the observation."""
     common, measurement = rules.common, rules.common.measurement
     observe_body(i, common)
+    columns, place = rules.columns, rules.goals.place
     if rules.with_ball:
-        place, physics = rules.goals.place, common.physics
-        observe_ball(i, rules.goal, place, physics, measurement, rules.ball, common.full)
+        physics, measurement = common.physics, common.measurement
+        observe_ball(i, columns, place, physics, measurement, rules.ball, common.full)
     else:
-        x, y = (
-            rules.goals.place[i, 0] - measurement.root[i, 0],
-            rules.goals.place[i, 1] - measurement.root[i, 1],
-        )
-        bearing, distance = polar(i, x, y, measurement)
-        common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
+        x = place[i, 0] - common.measurement.root[i, 0]
+        y = place[i, 1] - common.measurement.root[i, 1]
+        bearing, distance = polar(i, x, y, common.measurement)
+        common.full[i, columns.goal], common.full[i, columns.goal + 1] = bearing, distance
     publish(i, common)
 
 

@@ -16,28 +16,29 @@ from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import Block, columns, layout
+from trl_suite.kinematics.spatial_figure import body_blocks
 from trl_suite.motion import Steps
 from trl_suite.tasks.components.ball import (
     AT_GOAL,
-    MIRRORED,
-    SOCCER_TERMS,
+    BALL,
+    BALL_GOAL,
     Ball,
     goal_disc,
     no_ball,
+    soccer_terms,
 )
 from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.components.footstep_plan import (
-    CONTACT_SIZE,
-    PLAN_SIZE,
+    CONTACT,
+    PLAN,
     check_two_feet,
     footstep_plan,
     plan_markers,
-    plan_mirror,
 )
 from trl_suite.tasks.components.goal_drawer import GoalDrawer
-from trl_suite.tasks.components.goals import flag, goals
+from trl_suite.tasks.components.goals import GOAL, flag, goals
 from trl_suite.tasks.components.plans import Plans, span
-from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
     SUBSTEPS,
@@ -49,9 +50,9 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,
     GOAL_REACHED,
-    GOAL_SIGNS,
     MAPS,
     NAVIGATION_TERMS,
+    SURFACE,
     PlanningRules,
     PlanningState,
     begin_steps,
@@ -75,11 +76,10 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Marker,
     check_simulated,
-    consecutive,
     drawn_seed,
 )
+from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import SpatialGround
-from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, option
 
@@ -160,7 +160,7 @@ class HierarchicalNavigation(SpatialTask):
       pose, velocity: as in `SpatialImitation`.
       goal: bearing of the goal, rad to the left, and its distance, m; with a ball, measured from
         the ball.
-      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+      ball: with a ball, see `trl_suite.tasks.components.ball.BALL`; 9.
       low_level: observation of the footstep controller, with interface 'frame' only; see
         `SpatialFootsteps`.
 
@@ -197,11 +197,10 @@ class HierarchicalNavigation(SpatialTask):
         interface, step_length = config.interface, config.step_length
         self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
-        self.TERMS = SOCCER_TERMS if ball else NAVIGATION_TERMS
-        goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        self.terms = soccer_terms() if ball else NAVIGATION_TERMS
         super().__init__(
             character, arena, steps, SpatialConfig(substeps=config.substeps),
-            extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
+            extras=(CONTACT, PLAN),
         )  # fmt: skip
         self.controller = footstep_controller.load(config.controller)
         self.controller.check(self)
@@ -214,22 +213,28 @@ class HierarchicalNavigation(SpatialTask):
         )
         self._goal_drawer = GoalDrawer(arena, ball, 'far', config.goal_distance)
         self._frame = config.substeps
-        low = max(part.stop for part in self._full.values())
         if interface == 'plan':
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         self.action_map = plan_action_map(
             step_length, self.joint_map if interface == 'frame' else None
         )
-        pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
-        self.blocks = consecutive({
-            'terrain': SAMPLES**2 if 'height' in config.terrain_observation else 0,
-            'surface': 2 * SAMPLES**2 if 'velocity' in config.terrain_observation else 0,
-            **pose,
-            **{name: len(signs) for name, signs in goal_signs.items()},
-            'low_level': low if interface == 'frame' else 0,
-        })  # fmt: skip
+        terrain, pose, velocity = body_blocks(character, 'height' in config.terrain_observation)
+        low = Block(
+            'low_level', sum(block.size for block in self.full), '',
+            'observation of the footstep controller', 'the footstep controller has its own observation',
+        )  # fmt: skip
+        self.observed = (
+            terrain,
+            SURFACE.observed_if('velocity' in config.terrain_observation),
+            pose,
+            velocity,
+            BALL_GOAL if ball else GOAL,
+            BALL.observed_if(ball is not None),
+            low.observed_if(interface == 'frame'),
+        )
+        self.blocks = layout(self.observed)
         mirrors = interface == 'plan' and self.character.spec.mirror
-        self.mirror = planning_mirror(character, self.blocks, goal_signs) if mirrors else None
+        self.mirror = planning_mirror(character, self.observed) if mirrors else None
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
@@ -237,9 +242,6 @@ class HierarchicalNavigation(SpatialTask):
 
     def _typical_poses(self) -> np.ndarray:
         return typical_poses(self.steps, self._first)
-
-    def _extra_mirror(self, name: str) -> Reflection:
-        return plan_mirror(name)
 
     def bind(self, world: World) -> None:
         common, n = self._bind_rules(world), world.n
@@ -258,24 +260,19 @@ class HierarchicalNavigation(SpatialTask):
             'duration': self.state.duration,
         }
         self._goal_drawer.bind(world, self.goals, self.clock, self._random)
-        starts = {name: part.start for name, part in self.blocks.items()}
         balls = no_ball(n)
         if self.ball:
             self.ball.bind(world)
-            balls = self.ball.rules(
-                starts['ball'], float(self.config.target_speed), self.goal_reached
-            )
+            balls = self.ball.rules(float(self.config.target_speed), self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        low = self._full
-        names = 'terrain', 'surface', 'pose', 'velocity', 'goal', 'low_level'
         rules = PlanningRules(
             common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
-            contact=low['contact'].start, plan_block=low['plan'].start,
-            by_plan=self.interface == 'plan', plan_offset=self.action_map.action_offset,
-            plan_scale=self.action_map.action_scale, target_speed=float(self.config.target_speed),
-            goal_reached=self.goal_reached, with_ball=self.ball is not None, ball=balls,
-            **{name: starts.get(name, -1) for name in names},
+            low_columns=self._extra_columns(), columns=columns(self.observed, self.blocks),
+            terms=terms_data(NAVIGATION_TERMS), by_plan=self.interface == 'plan',
+            plan_offset=self.action_map.action_offset, plan_scale=self.action_map.action_scale,
+            target_speed=float(self.config.target_speed), goal_reached=self.goal_reached,
+            with_ball=self.ball is not None, ball=balls,
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._low_action = np.zeros((n, len(self.joint_map)))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.kinematics.blocks import HEIGHTS, Block, Reflection
 from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial_figure import LINES
 from trl_suite.tasks.components.ball import (
     BallRules,
     dribble,
@@ -30,9 +32,8 @@ from trl_suite.tasks.components.spatial_rules import (
     tick,
 )
 from trl_suite.tasks.components.trace import Trace, follow
-from trl_suite.tasks.task import (
-    conclude,
-)
+from trl_suite.tasks.task import conclude
+from trl_suite.tasks.terms import Term, give
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_loop
@@ -40,10 +41,26 @@ from trl_suite.util.compiled import compiled, compiled_loop
 CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
 MAPS = ('height', 'velocity')
 GOAL_REACHED = 1.0  # m; default
-GOAL_SIGNS = (-1.0, 1.0)  # of mirrored bearing and distance
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # constant reward of a step without a fall
-NAVIGATION_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
+NAVIGATION_TERMS = (
+    Term(
+        'speed', 1 - UPRIGHT,
+        f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2), v: speed of the centre of mass towards the '
+        'goal, m/s',
+    ),
+    Term('upright', UPRIGHT, '1'),
+)  # fmt: skip
+SURFACE = Block(
+    'surface', 2 * SAMPLES**2, 'm/s',
+    'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
+    'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then all '
+    'components to the right',
+    HEIGHTS._replace(bias=(0.0, 0.0, 0.0)),
+    Reflection(
+        np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)
+    ),
+)  # fmt: skip
 CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
     0.9,
     1 / 11,
@@ -52,8 +69,6 @@ CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
 FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 LONGEST = 60  # limit of control steps per step; the clock switches stance long before
-
-SPEED, ON_FEET = range(len(NAVIGATION_TERMS))
 
 
 class PlanningState(NamedTuple):
@@ -84,10 +99,10 @@ class PlanningRules(NamedTuple):
     The full observation of `common` is the observation of the footstep controller.
 
     Attributes:
-      contact, plan_block: first columns of these blocks in the full observation.
+      low_columns: first columns of the blocks contact and plan in the full observation.
+      columns: first columns of the blocks of the observation; -1: not observed.
+      terms: the reward terms of a goal.
       by_plan: whether a step is a footstep, not a control step.
-      terrain, surface, pose, velocity, goal, low_level: first columns of these blocks in the
-        observation; -1: not observed.
       plan_offset, plan_scale: offset and scale of actions.
       target_speed, goal_reached: see `HierarchicalConfig`, m/s and m.
       with_ball: whether the goal is that of a ball.
@@ -98,15 +113,10 @@ class PlanningRules(NamedTuple):
     goals: Goals
     state: PlanningState
     trace: Trace
-    contact: int
-    plan_block: int
+    low_columns: Any
+    columns: Any
+    terms: Any
     by_plan: bool
-    terrain: int
-    surface: int
-    pose: int
-    velocity: int
-    goal: int
-    low_level: int
     plan_offset: np.ndarray
     plan_scale: np.ndarray
     target_speed: float
@@ -163,7 +173,7 @@ def observe_low(i: int, rules: PlanningRules) -> None:
     """Writes the observation of the footstep controller."""
     common = rules.common
     observe_body(i, common)
-    observe_plan(i, rules.contact, rules.plan_block, common.measurement, rules.plan, common.full)
+    observe_plan(i, rules.low_columns, common.measurement, rules.plan, common.full)
 
 
 @compiled
@@ -201,7 +211,7 @@ def finish_control_step(i: int, rules: PlanningRules) -> bool:
 def score(i: int, rules: PlanningRules) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
     common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
-    measurement, terms = common.measurement, common.outcome.reward_terms
+    measurement, outcome = common.measurement, common.outcome
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
     goals.wanted[i] = ball.wanted[i] = False
@@ -209,7 +219,7 @@ def score(i: int, rules: PlanningRules) -> bool:
         return False
     if rules.with_ball:
         state.speed[i] = dribble(
-            i, 0, 1.0, seconds, goals.place, common.physics, measurement, rules.ball, terms
+            i, seconds, goals.place, common.physics, measurement, rules.ball, outcome
         )
     else:
         x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
@@ -222,7 +232,8 @@ def score(i: int, rules: PlanningRules) -> bool:
         lack = min(speed - rules.target_speed, 0.0)
         full = distance < rules.goal_reached
         worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
-        terms[i, SPEED], terms[i, ON_FEET] = (1 - UPRIGHT) * worth, UPRIGHT
+        give(i, worth, rules.terms.speed, outcome)
+        give(i, 1.0, rules.terms.upright, outcome)
         state.speed[i] = speed
     if common.outcome.failed[i]:
         return False
@@ -254,25 +265,25 @@ def finish(i: int, rules: PlanningRules) -> None:
 @compiled
 def observe(i: int, rules: PlanningRules) -> None:
     """Writes the observation."""
-    common, measurement = rules.common, rules.common.measurement
+    common, measurement, columns = rules.common, rules.common.measurement, rules.columns
     observation = common.outcome.observation
-    write_terrain(i, rules.terrain, common.ground, measurement, observation)
-    if rules.surface >= 0:
-        block = observation[i, rules.surface : rules.surface + 2 * SAMPLES * SAMPLES]
+    write_terrain(i, columns.terrain, common.ground, measurement, observation)
+    if columns.surface >= 0:
+        block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
         x, y = measurement.root[i, 0], measurement.root[i, 1]
         spatial_ground.velocity_map(i, x, y, measurement.heading[i], common.ground, block)
-    write_body(i, rules.pose, rules.velocity, measurement, observation)
+    write_body(i, columns.pose, columns.velocity, measurement, observation)
     place = rules.goals.place
     if rules.with_ball:
-        observe_ball(i, rules.goal, place, common.physics, measurement, rules.ball, observation)
+        observe_ball(i, columns, place, common.physics, measurement, rules.ball, observation)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
         bearing, distance = polar(i, x, y, measurement)
-        observation[i, rules.goal], observation[i, rules.goal + 1] = bearing, distance
-    if rules.low_level >= 0:
+        observation[i, columns.goal], observation[i, columns.goal + 1] = bearing, distance
+    if columns.low_level >= 0:
         observe_low(i, rules)
         for k in range(common.full.shape[1]):
-            observation[i, rules.low_level + k] = common.full[i, k]
+            observation[i, columns.low_level + k] = common.full[i, k]
 
 
 # Loops over simulations; they take packs.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.characters import Character
+from trl_suite.kinematics.blocks import Block, layout, reflected, signs
+from trl_suite.kinematics.spatial import LINK_POSE
 from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.components import reflection as reflection3d
 
 INTERFACES = ('plan', 'frame')
 # A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
@@ -37,25 +36,14 @@ def plan_action_map(step_length: float, joint_map: ActionMap | None = None) -> A
     return ActionMap(names, 'footstep plan', 'm (turn: rad)', offset, scale)
 
 
-def planning_mirror(
-    character: Character, blocks: dict[str, slice], signs: Mapping[str, Sequence[float]]
-) -> Mirror:
-    """Returns the reflection of observations and plans.
+def planning_mirror(character: Character, blocks: tuple[Block, ...]) -> Mirror:
+    """Returns the reflection of observations with these blocks, and of plans.
 
     Args:
       character: the character, which has pairs of right and left links.
-      blocks: slices of the observation blocks: terrain, surface, pose, velocity and those of
-        `signs`.
-      signs: signs of the mirrored numbers of further blocks, by name.
+      blocks: the observation blocks.
     """
-    parts = reflection3d.body(character)
-    lines, _ = parts['terrain']
-    ahead = np.ones(len(lines))
-    parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
-    for name, block_signs in signs.items():
-        parts[name] = np.arange(len(block_signs)), np.array(block_signs)
-    index, sign = reflection3d.joined(blocks, parts)
     links = list(character.spec.links)
     feet = [links.index(name) for name in character.spec.end_effectors]
-    right, left = blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
-    return Mirror(index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left))
+    right, left = layout(blocks)['pose'].start + 1 + LINK_POSE * np.array(feet)
+    return Mirror(*reflected(blocks), *signs(PLAN_SIGNS), feet=(right, left))

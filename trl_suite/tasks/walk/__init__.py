@@ -1,11 +1,7 @@
 """Walking without a reference motion: for characters without a clip, and for custom tasks."""
 
-from trl_suite.tasks.components import spatial_description
-from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
 from trl_suite.tasks.task_type import Description, Parts, TaskType
 from trl_suite.tasks.walk.task import WALK, PlanarWalkConfig, SpatialWalkConfig, Walk
-
-_HEADING = ('1', 'cosine and sine of the bearing of the target heading, the heading at the start')
 
 
 def _make(parts: Parts, config: PlanarWalkConfig | SpatialWalkConfig) -> Walk:
@@ -19,7 +15,7 @@ TYPES = (
         spatial=False,
         config=PlanarWalkConfig,
         make=_make,
-        description=Description(blocks=lambda task: PLANAR_BLOCKS),
+        description=Description(),
         options=(('rewards', WALK),),
     ),
     TaskType(
@@ -28,9 +24,7 @@ TYPES = (
         spatial=True,
         config=SpatialWalkConfig,
         make=_make,
-        description=Description(
-            blocks=lambda task: {**spatial_description.BLOCKS, 'target_heading': _HEADING}
-        ),
+        description=Description(),
         options=(('rewards', WALK),),
     ),
 )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.engine import native
 from trl_suite.kinematics import planar, spatial
+from trl_suite.kinematics.blocks import Block, Noise
 from trl_suite.kinematics.planar import (
     PlanarBody,
     PlanarMeasurement,
@@ -72,7 +73,7 @@ class SpatialRules(NamedTuple):
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      terrain, pose, velocity, target_heading: first columns of these blocks; -1: not observed.
+      columns: first columns of the observation blocks; -1: not observed.
       leaving: whether the walker has left its ground window, which must then be moved, (n,).
     """
 
@@ -82,10 +83,7 @@ class SpatialRules(NamedTuple):
     ground: SpatialWindows
     drive: Drive
     ctrl: np.ndarray
-    terrain: int
-    pose: int
-    velocity: int
-    target_heading: int
+    columns: Any
     measurement: SpatialMeasurement
     state: WalkState
     leaving: np.ndarray
@@ -142,15 +140,22 @@ def look_spatial(i: int, rules: SpatialRules) -> None:
     measurement, state, observation = rules.measurement, rules.state, rules.outcome.observation
     spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
     spatial.measure(i, rules.body, rules.physics, rules.ground, measurement)
-    write_terrain(i, rules.terrain, rules.ground, measurement, observation)
-    write_body(i, rules.pose, rules.velocity, measurement, observation)
+    columns = rules.columns
+    write_terrain(i, columns.terrain, rules.ground, measurement, observation)
+    write_body(i, columns.pose, columns.velocity, measurement, observation)
     bearing = state.target_heading[i] - measurement.heading[i]
-    observation[i, rules.target_heading] = math.cos(bearing)
-    observation[i, rules.target_heading + 1] = math.sin(bearing)
+    observation[i, columns.target_heading] = math.cos(bearing)
+    observation[i, columns.target_heading + 1] = math.sin(bearing)
     x, y = measurement.root[i, 0] - state.origin[i, 0], measurement.root[i, 1] - state.origin[i, 1]
     state.distance[i] = (
         math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
     )
+
+
+TARGET_HEADING = Block(
+    'target_heading', 2, '1', 'cosine and sine of the bearing of the target heading, the heading at the start',
+    Noise((0.005, 0.02, 0.05)),
+)  # fmt: skip
 
 
 @compiled_loop

@@ -13,6 +13,7 @@ from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.blocks import columns
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.kinematics.spatial_figure import SpatialFigure
@@ -32,13 +33,12 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_position_options,
-    consecutive,
     drawn_seed,
-    outcome,
 )
 from trl_suite.tasks.walk.rules import (
     FROUDE,
     GRAVITY,
+    TARGET_HEADING,
     PlanarRules,
     SpatialRules,
     WalkState,
@@ -148,7 +148,7 @@ class Walk(Task):
             character, actuation_model, self.physics_timestep,
             **({} if scale is None else {'action_scale': scale}),
         )  # fmt: skip
-        self.blocks = consecutive({**self.figure.blocks, 'target_heading': 2 * self._spatial})
+        self.observed = *self.figure.blocks, TARGET_HEADING.observed_if(self._spatial)
 
     @property
     def root_entity(self) -> PlanarArena | SpatialArena:
@@ -166,39 +166,27 @@ class Walk(Task):
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
         self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
-        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), 0)
+        self._allocate(n, self.state.distance)
         self.saved = (self.state, self.outcome)
-        self.info_arrays = {
-            'reward_terms': {},
-            'fell': self.outcome.fell,
-            'diverged': self.outcome.diverged,
-            'distance': self.state.distance,
-        }
         scope = f'{self.character.mjcf_model.model}/'
         # The controls are consecutive.
         first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
-        common: Any = (
-            world.engine,
-            figure.body,
-            figure.state,
-            figure.ground,
-            self.action_map.drive(first),
-        )
-        starts = {name: part.start for name, part in self.blocks.items()}
+        common: Any = {
+            'engine': world.engine, 'body': figure.body, 'physics': figure.state,
+            'ground': figure.ground, 'drive': self.action_map.drive(first), 'ctrl': world.ctrl,
+            'state': self.state, 'outcome': self.outcome,
+        }  # fmt: skip
         rules: SpatialRules | PlanarRules
         if self._spatial:
-            rules = SpatialRules(  # type: ignore[call-arg]
-                *common, world.ctrl,
-                *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'target_heading')),
-                figure.measurement, self.state, np.zeros(n, bool), self.outcome,
+            rules = SpatialRules(
+                **common, columns=columns(self.observed, self.blocks),
+                measurement=figure.measurement, leaving=np.zeros(n, bool),
             )  # fmt: skip
             self._leaving = rules.leaving
             self._act, self._finish = act_spatial, finish_spatial
         else:
             measurement = figure.empty_measurement()
-            rules = PlanarRules(  # type: ignore[call-arg]
-                *common, world.ctrl, measurement, self.state, self.outcome
-            )
+            rules = PlanarRules(**common, measurement=measurement)
             self._leaving = measurement.leaving
             self._act, self._finish = act_planar, finish_planar
         self._pack = packed(rules)
