@@ -15,6 +15,7 @@ actions in [-1, 1], (n, 17). It must be stateless; the observation includes the 
 from __future__ import annotations
 
 import os
+import types
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +23,8 @@ from typing import Any
 import numpy as np
 
 from trl_suite import characters, policies
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.characters import CharacterSpec
 
 Function = Callable[[np.ndarray], Any]
 
@@ -39,21 +42,23 @@ class Controller:
         self._size: int | None = None  # of an action, once it is known
         self.policy = function if isinstance(function, policies.Policy) else None
 
-    def check(self, task: Any) -> None:
-        """Checks that observations and actions of a footstep task fit the controller.
+    def check(
+        self, character: CharacterSpec, blocks: dict[str, slice], action_map: ActionMap
+    ) -> None:
+        """Checks that the controller has these observation blocks and actions.
 
         Functions other than policies can only be checked when they are called. If a policy was
         trained with another body, a warning is issued, since it may still work.
 
         Raises:
-          ValueError: they do not fit; the message has both.
+          ValueError: it has others; the message has both.
         """
-        self._size = len(task.action_map)
+        self._size = len(action_map)
         if self.policy is None:
             return
-        self.policy.check(task)
+        self.policy.check(types.SimpleNamespace(blocks=blocks, action_map=action_map))
         trained = self.policy.info.get('character')
-        own = characters.fingerprint(task.character.spec)
+        own = characters.fingerprint(character)
         if trained is not None and trained != own:
             warnings.warn(
                 f'controller {self.name} was trained with body {trained}; this one is {own}',

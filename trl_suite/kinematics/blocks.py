@@ -111,11 +111,11 @@ def layout(blocks: Iterable[Block]) -> dict[str, slice]:
     return found
 
 
-def columns(blocks: Iterable[Block], slices: Mapping[str, slice]) -> Any:
-    """Returns the first column of each block for compiled functions; -1: it is not observed."""
-    return by_name('Columns', {
-        each.name: slices[each.name].start if each.name in slices else -1 for each in blocks
-    })  # fmt: skip
+def columns(blocks: Iterable[Block]) -> Any:
+    """Returns the first column of each block for compiled functions; -1: it is empty."""
+    blocks = tuple(blocks)
+    starts = {name: part.start for name, part in layout(blocks).items()}
+    return by_name('Columns', {block.name: starts.get(block.name, -1) for block in blocks})
 
 
 def by_name(kind: str, values: Mapping[str, Any]) -> Any:

@@ -28,9 +28,10 @@ from trl_suite.tasks.components.spatial_rules import (
     PHASE,
     SUBSTEPS,
     Clock,
-    SpatialRules,
     Travel,
     View,
+    WalkerData,
+    act_all,
 )
 from trl_suite.tasks.task import (
     MOST_SUBSTEPS,
@@ -42,6 +43,7 @@ from trl_suite.tasks.task import (
     start_phases,
 )
 from trl_suite.terrain import SpatialGround
+from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, option
 
 
@@ -92,98 +94,64 @@ def maps(names: str | Collection[str]) -> tuple[str, ...]:
 class SpatialTask(Task):
     """A 3D walker with a clock that has the period of its reference motion.
 
-    A subclass defines the start of an episode, the reward, and further observation blocks, which
-    follow terrain, pose, velocity and phase.
+    A subclass defines observation, reward and the start of an episode.
 
     Attributes:
       figure: the character in every simulation.
       clock: phase of each simulation in its cycle.
       period: duration of a cycle, s.
+      joint_map: the map from actions of the joints to actuators.
       mirror: reflection of observations and actions, for policies; None if it is not available.
-      full: the blocks of the full observation, from which the observation is derived.
     """
 
     ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
     fields: tuple[str, ...] = SpatialFigure.fields
     config: Any  # options of the subclass
-    period: float
+    mirror: Mirror | None = None
+    mirrored = False  # whether observations and actions are mirrored in left stance
 
     def __init__(
         self,
         character: Character,
         arena: SpatialArena,
         motion: Clip | Steps,
-        config: SpatialConfig,
+        typical_poses: np.ndarray,
+        config: Any,
         *,
+        period: float,
         actuation_model: str = 'position',
-        phase: bool = True,
-        extras: tuple[Block, ...],
-        hidden: Collection[str] = (),
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
+        terrain_observation: bool = False,
     ) -> None:
-        """Composes the task; see the subclasses.
+        """Attaches the walker and its actuators to the arena.
 
         Args:
           character: a spatial character without actuators; it is attached to the arena.
           arena: the arena with its terrain.
           motion: the reference motion.
-          config: the options.
+          typical_poses: poses whose mean is action 0 of position control, (k, columns of a pose).
+          config: the options, of which `substeps` and `terrain_level` are used here.
+          period: duration of a cycle, s.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          phase: whether the phase is observed.
-          extras: the blocks of a subclass.
-          hidden: names of blocks that are not observed.
+          action_offset, action_scale: options of position control; see `SpatialConfig`.
+          terrain_observation: whether the figure has a block of ground heights.
 
         Raises:
           ValueError: incompatible options, or a motion that does not fit the character.
         """
-        mirrored = getattr(config, 'mirrored', False)
-        spec = character.spec
         check_motion(character, motion)
-        check_position_options(actuation_model, config.action_offset, config.action_scale)
-        if mirrored and not spec.mirror:
-            raise ValueError(
-                f'character {spec.name!r} has no pairs of right and left links; mirrored observations '
-                'need them'
-            )
-        if mirrored and not phase:
-            raise ValueError(
-                'mirrored observations need the phase, which determines the stance foot'
-            )
+        check_position_options(actuation_model, action_offset, action_scale)
         self.character, self.arena, self.motion = character, arena, motion
-        self.actuation_model, self.config = actuation_model, config
-        self.mirrored = mirrored
-        self._start_phase = start_phases(config.start_phase)
-        self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
+        self.actuation_model, self.config, self.period = actuation_model, config, period
+        self.figure = SpatialFigure(character, arena, terrain_observation)
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         options: dict[str, Any] = {}
         if actuation_model == 'position':
-            options = position_range(
-                self._typical_poses(), motion, config.action_offset, config.action_scale
-            )
-        self.action_map = actuation.add(
-            character, actuation_model, self.physics_timestep, **options
-        )
-        self.joint_map = self.action_map  # actions to actuators; a subclass may replace action_map
-        self._extras = extras
-        self._own = *self.figure.blocks, PHASE.observed_if(phase)
-        self.full = *self._own, *extras
-        self._full = layout(self.full)
-        given = tuple(block for block in self.full if block.name not in hidden)
-        self._reflection = self._reflected(self.full)
-        self.mirror = None if mirrored else self._reflected(given)
-        self._kept: np.ndarray = np.zeros(0, int)  # all
-        if mirrored or hidden:
-            self._kept = np.concatenate([
-                self._full[block.name].start + np.array(
-                    block.kept if mirrored and block.kept else range(block.size)
-                ) for block in given if block.size
-            ])  # fmt: skip
-        self.observed = tuple(block.mirrored() for block in given) if mirrored else given
+            options = position_range(typical_poses, motion, action_offset, action_scale)
+        self.joint_map = actuation.add(character, actuation_model, self.physics_timestep, **options)
 
     # Methods of a subclass.
-
-    @abc.abstractmethod
-    def _typical_poses(self) -> np.ndarray:
-        """Returns poses whose mean is action 0 of position control, (k, columns of a pose)."""
 
     @abc.abstractmethod
     def _start(
@@ -204,8 +172,8 @@ class SpatialTask(Task):
     def root_entity(self) -> SpatialArena:
         return self.arena
 
-    def _bind_rules(self, world: World) -> SpatialRules:
-        """Binds the common parts; a subclass may extend `saved` and `info_arrays` afterwards."""
+    def _bind_walker(self, world: World) -> None:
+        """Binds the walker; a subclass may extend `saved` and `info_arrays` afterwards."""
         self.world, n = world, world.n
         figure = self.figure
         figure.bind(world, self.ABOUT)
@@ -213,48 +181,22 @@ class SpatialTask(Task):
         self.travel = Travel(np.zeros((n, 3)), np.zeros(n))
         self._random = [np.random.default_rng(0)] * n  # for draws within an episode
         self._allocate(n, self.travel.distance)
-        self._full_observation = self.outcome.observation
-        if self.observed != self.full:
-            size = sum(block.size for block in self.full)
-            self._full_observation = np.zeros((n, size))
+        self.saved = (self.clock, self.travel, self.outcome)
         scope = f'{self.character.mjcf_model.model}/'
         # The controls are consecutive.
         first = int(world.control_addresses([scope + self.joint_map.actuators[0]])[0])
-        self.saved = (
-            self.clock, self.travel, self.outcome, Full(self._full_observation),
-        )  # fmt: skip
-        return SpatialRules(
+        self.walker = WalkerData(
             engine=world.engine,
             body=figure.body,
             physics=figure.state,
             ground=figure.ground,
             drive=self.joint_map.drive(first),
             ctrl=world.ctrl,
-            period=self.period,
-            columns=columns(self._own, self._full),
-            given=self._view(),
-            clock=self.clock,
-            travel=self.travel,
             measurement=figure.measurement,
-            full=self._full_observation,
-            action=np.zeros((n, len(self.joint_map))),
             leaving=np.zeros(n, bool),
             outcome=self.outcome,
         )
-
-    def _extra_columns(self) -> Any:
-        """Returns the first columns of the blocks of the subclass in the full observation."""
-        return columns(self._extras, self._full)
-
-    def _view(self) -> View:
-        mirror, none = self._reflection, np.zeros(0, int)
-        if mirror is None or not self.mirrored:
-            return View(False, none, np.zeros(0), 0, self._kept, 0, none, np.zeros(0))
-        assert mirror.phase is not None
-        return View(
-            True, mirror.observation_index, mirror.observation_sign, mirror.phase, self._kept,
-            self.blocks['phase'].start, mirror.action_index, mirror.action_sign,
-        )  # fmt: skip
+        self._walker_pack = packed(self.walker)
 
     @property
     def phase(self) -> np.ndarray:
@@ -280,6 +222,130 @@ class SpatialTask(Task):
         self.observe(env_ids)
         self.outcome.reward_terms[env_ids] = 0.0
 
+    def _begin_clocks(self, env_ids: np.ndarray) -> None:
+        """Sets the clocks of some simulations to `clock.start`."""
+        cycles = np.rint(self.clock.start[env_ids] * _DIGITS) / _DIGITS
+        self.clock.cycles[env_ids], self.clock.phase[env_ids] = cycles, cycles - np.floor(cycles)
+
+    def _lay_ground(self, env_ids: np.ndarray) -> None:
+        """Moves the ground windows of those simulations that have left theirs."""
+        leaving = env_ids[self.walker.leaving[env_ids]]
+        self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
+
+    def get_state(self, env_id: int) -> dict[str, Any]:
+        return {
+            **super().get_state(env_id),
+            'random': self._random[env_id].bit_generator.state,
+        }
+
+    def set_state(self, env_id: int, state: dict[str, Any]) -> None:
+        super().set_state(env_id, state)
+        self._random[env_id] = np.random.default_rng(0)
+        self._random[env_id].bit_generator.state = state['random']
+
+
+class TrackingTask(SpatialTask):
+    """A 3D walker whose joints are controlled 30 times per second, as in a reference motion.
+
+    A subclass defines further observation blocks, which follow terrain, pose, velocity and phase.
+
+    Attributes:
+      full: the blocks of the full observation, from which the observation is derived.
+    """
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        motion: Clip | Steps,
+        typical_poses: np.ndarray,
+        config: SpatialConfig,
+        *,
+        period: float,
+        actuation_model: str = 'position',
+        phase: bool = True,
+        extras: tuple[Block, ...],
+        hidden: Collection[str] = (),
+    ) -> None:
+        """Composes the task; see `SpatialTask` and the subclasses.
+
+        Args:
+          character, arena, motion, typical_poses, period, actuation_model: see `SpatialTask`.
+          config: the options.
+          phase: whether the phase is observed.
+          extras: the blocks of a subclass.
+          hidden: names of blocks that are not observed.
+
+        Raises:
+          ValueError: incompatible options, or a motion that does not fit the character.
+        """
+        self.mirrored = mirrored = getattr(config, 'mirrored', False)
+        if mirrored and not character.spec.mirror:
+            raise ValueError(
+                f'character {character.spec.name!r} has no pairs of right and left links; mirrored '
+                'observations need them'
+            )
+        if mirrored and not phase:
+            raise ValueError(
+                'mirrored observations need the phase, which determines the stance foot'
+            )
+        super().__init__(
+            character, arena, motion, typical_poses, config, period=period,
+            actuation_model=actuation_model, action_offset=config.action_offset,
+            action_scale=config.action_scale,
+            terrain_observation='height' in config.terrain_observation,
+        )  # fmt: skip
+        self.action_map = self.joint_map
+        self._start_phase = start_phases(config.start_phase)
+        self.full = *self.figure.blocks, PHASE.observed_if(phase), *extras
+        given = tuple(block for block in self.full if block.name not in hidden)
+        self._reflection = self._reflected(self.full)
+        self.mirror = None if mirrored else self._reflected(given)
+        self._kept: np.ndarray = np.zeros(0, int)  # all
+        if mirrored or hidden:
+            slices = layout(self.full)
+            self._kept = np.concatenate([
+                slices[block.name].start + np.array(
+                    block.kept if mirrored and block.kept else range(block.size)
+                ) for block in given if block.size
+            ])  # fmt: skip
+        self.observed = tuple(block.mirrored() for block in given) if mirrored else given
+
+    def _reflected(self, blocks: tuple[Block, ...]) -> Mirror | None:
+        """Returns the reflection of these blocks and of actions; None if there is none."""
+        slices = layout(blocks)
+        if 'phase' not in slices or not self.character.spec.mirror:
+            return None
+        actions = action_reflection(self.character, self.action_map)
+        return Mirror(*reflected(blocks), *actions, slices['phase'].start)
+
+    def _bind_view(self, world: World) -> View:
+        """Binds walker and full observation."""
+        self._bind_walker(world)
+        full = self.outcome.observation
+        if self.observed != self.full:
+            full = np.zeros((world.n, sum(block.size for block in self.full)))
+            self.saved = (*self.saved, Full(full))
+        none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
+        view = View(
+            full=full,
+            columns=columns(self.full),
+            mirrored=self.mirrored,
+            source=none if mirror is None else mirror.observation_index,
+            sign=np.zeros(0) if mirror is None else mirror.observation_sign,
+            kept=self._kept,
+            given_phase=self.blocks['phase'].start if self.mirrored else -1,
+            action_source=none if mirror is None else mirror.action_index,
+            action_sign=np.zeros(0) if mirror is None else mirror.action_sign,
+            action=np.zeros((world.n, len(self.joint_map))),
+        )
+        self._view_pack = packed(view)
+        return view
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._walker_pack, self._view_pack):
+            self._lay_ground(env_ids)
+
     def _begin_grounds(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> np.ndarray:
@@ -298,35 +364,6 @@ class SpatialTask(Task):
             self.arena.begin_episode(i, ground, spawns[k, :2])
         self._begin_clocks(env_ids)
         return spawns
-
-    def _begin_clocks(self, env_ids: np.ndarray) -> None:
-        """Sets the clocks of some simulations to `clock.start`."""
-        cycles = np.rint(self.clock.start[env_ids] * _DIGITS) / _DIGITS
-        self.clock.cycles[env_ids], self.clock.phase[env_ids] = cycles, cycles - np.floor(cycles)
-
-    def _lay_ground(self, env_ids: np.ndarray, rules: SpatialRules) -> None:
-        """Moves the ground windows of those simulations that have left theirs."""
-        leaving = env_ids[rules.leaving[env_ids]]
-        self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
-
-    def get_state(self, env_id: int) -> dict[str, Any]:
-        return {
-            **super().get_state(env_id),
-            'random': self._random[env_id].bit_generator.state,
-        }
-
-    def set_state(self, env_id: int, state: dict[str, Any]) -> None:
-        super().set_state(env_id, state)
-        self._random[env_id] = np.random.default_rng(0)
-        self._random[env_id].bit_generator.state = state['random']
-
-    def _reflected(self, blocks: tuple[Block, ...]) -> Mirror | None:
-        """Returns the reflection of these blocks and of actions; None if there is none."""
-        slices = layout(blocks)
-        if 'phase' not in slices or not self.character.spec.mirror:
-            return None
-        actions = action_reflection(self.character, self.action_map)
-        return Mirror(*reflected(blocks), *actions, slices['phase'].start)
 
 
 class Full(NamedTuple):

@@ -16,15 +16,14 @@ from trl_suite.kinematics.spatial import (
     is_lost,
 )
 from trl_suite.kinematics.spatial import measure as measure_body
-from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
     too_fast,
 )
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SpatialWindows
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.terrain.spatial.windows import SAMPLES, SpatialWindows
+from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
 
 CONTROL_TIMESTEP = 1 / 30  # s
 TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
@@ -64,38 +63,11 @@ class Travel(NamedTuple):
     distance: np.ndarray
 
 
-class View(NamedTuple):
-    """How observation and action are derived from the full observation, with optional mirroring.
-
-    Attributes:
-      mirrored: whether observations and actions are reflected in left stance.
-      source, sign: a reflected full observation is `full[source] * sign`, (size,).
-      phase: column of the phase in the full observation.
-      kept: columns of the full observation that are observed, (k,); all of them if it is empty.
-      given_phase: column of the phase in the observation.
-      action_index, action_sign: a reflected action is `action[index] * sign`.
-    """
-
-    mirrored: bool
-    source: np.ndarray
-    sign: np.ndarray
-    phase: int
-    kept: np.ndarray
-    given_phase: int
-    action_index: np.ndarray
-    action_sign: np.ndarray
-
-
-class SpatialRules(NamedTuple):
-    """Data for the compiled functions of all these tasks.
+class WalkerData(NamedTuple):
+    """A 3D walker in all simulations, for compiled functions.
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      period: period of the reference motion, s.
-      columns: first columns of the blocks that `observe_body` writes, in the full observation; -1:
-        absent.
-      full: the full observation, (n, size).
-      action: actions after reflection, (n, k); scratch.
       leaving: whether the walker has left its ground window, which must then be moved, (n,).
     """
 
@@ -105,105 +77,120 @@ class SpatialRules(NamedTuple):
     ground: SpatialWindows
     drive: Drive
     ctrl: np.ndarray
-    period: float
-    columns: Any
-    given: View
-    clock: Clock
-    travel: Travel
     measurement: SpatialMeasurement
-    full: np.ndarray
-    action: np.ndarray
     leaving: np.ndarray
     outcome: Outcome
+
+
+class View(NamedTuple):
+    """The full observation, and what of it is observed, with optional mirroring in left stance.
+
+    Attributes:
+      full: the full observation, (n, size).
+      columns: first columns of its blocks; -1: absent.
+      mirrored: whether observations and actions are reflected in left stance.
+      source, sign: a reflected full observation is `full[source] * sign`, (size,).
+      kept: columns of the full observation that are observed, (k,); all of them if it is empty.
+      given_phase: column of the phase in the observation.
+      action_source, action_sign: a reflected action is `action[source] * sign`.
+      action: actions after reflection, (n, k); scratch.
+    """
+
+    full: np.ndarray
+    columns: Any
+    mirrored: bool
+    source: np.ndarray
+    sign: np.ndarray
+    kept: np.ndarray
+    given_phase: int
+    action_source: np.ndarray
+    action_sign: np.ndarray
+    action: np.ndarray
 
 
 # Parts of a step of simulation i.
 
 
 @compiled
-def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
-    """Writes controls and drives moving boxes; returns whether the ground window must be moved.
+def control(i: int, action: np.ndarray, walker: WalkerData) -> bool:
+    """Writes controls and drives moving boxes, unless the ground window must be moved.
 
     It is moved before the physics steps, so that images rendered afterwards are up to date.
-    """
-    given = rules.given
-    left = given.mirrored and rules.full[i, given.phase] >= 0.5
-    for k in range(rules.action.shape[1]):
-        if left:
-            rules.action[i, k] = action[i, given.action_index[k]] * given.action_sign[k]
-        else:
-            rules.action[i, k] = action[i, k]
-    drive(i, rules.action, rules.drive, rules.ctrl)
-    return prepare_ground(i, rules)
-
-
-@compiled
-def prepare_ground(i: int, rules: SpatialRules) -> bool:
-    """Drives moving boxes before a control step, unless the ground window must be moved.
 
     Returns:
       Whether the ground window must be moved, which drives the boxes as well.
     """
-    root = rules.body.links[0]
-    x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
-    rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
-    if not rules.leaving[i] and spatial_ground.keep_moving(
-        i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
+    drive(i, action, walker.drive, walker.ctrl)
+    root = walker.body.links[0]
+    x, y = walker.physics.xpos[i, root, 0], walker.physics.xpos[i, root, 1]
+    walker.leaving[i] = spatial_ground.has_left(i, x, y, walker.ground)
+    if not walker.leaving[i] and spatial_ground.keep_moving(
+        i, x, y, walker.physics.qpos, walker.physics.qvel, walker.ground
     ):
-        native.forward(i, rules.engine)
-    return rules.leaving[i]
+        native.forward(i, walker.engine)
+    return walker.leaving[i]
 
 
 @compiled
-def tick(i: int, rules: SpatialRules) -> None:
-    """Advances the clock by a control step."""
-    rules.clock.steps[i] += 1
-    read_clock(i, rules)
-
-
-@compiled
-def read_clock(i: int, rules: SpatialRules) -> None:
-    """Computes the phase."""
-    clock = rules.clock
-    cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / rules.period)
+def tick(i: int, period: float, clock: Clock) -> None:
+    """Advances a clock of this period, s, by a control step."""
+    clock.steps[i] += 1
+    cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / period)
     # Rounded, so that rounding errors of the sum do not delay the switch of stance at half a cycle.
     clock.cycles[i] = np.rint(cycles * _DIGITS) / _DIGITS
     clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
 
 
 @compiled
-def breaks_down(i: int, rules: SpatialRules) -> bool:
+def breaks_down(i: int, walker: WalkerData) -> bool:
     """Returns whether a simulation diverged or left its ground: it keeps the last observation."""
     diverged = (
-        native.diverged(i, rules.engine)
-        or too_fast(i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel)
-        or is_lost(i, rules.body, rules.physics, rules.ground)
+        native.diverged(i, walker.engine)
+        or too_fast(i, walker.body.joint_dof, MAX_JOINT_SPEED, walker.physics.qvel)
+        or is_lost(i, walker.body, walker.physics, walker.ground)
     )
-    rules.outcome.diverged[i] = diverged
+    walker.outcome.diverged[i] = diverged
     return diverged
 
 
 @compiled
-def measure(i: int, rules: SpatialRules) -> None:
+def measure(i: int, walker: WalkerData) -> None:
     """Measures the body, relative to the current ground."""
-    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
-    measure_body(i, rules.body, rules.physics, rules.ground, rules.measurement)
-    x = rules.measurement.root[i, 0] - rules.travel.origin[i, 0]
-    y = rules.measurement.root[i, 1] - rules.travel.origin[i, 1]
-    rules.travel.distance[i] = np.sqrt(x * x + y * y)
+    spatial_ground.see_movers(i, walker.physics.qpos, walker.ground)
+    measure_body(i, walker.body, walker.physics, walker.ground, walker.measurement)
 
 
 @compiled
-def observe_body(i: int, rules: SpatialRules) -> None:
-    """Writes the blocks terrain, pose, velocity and phase of the full observation."""
-    columns, full = rules.columns, rules.full
-    write_terrain(i, columns.terrain, rules.ground, rules.measurement, full)
-    write_body(i, columns.pose, columns.velocity, rules.measurement, full)
+def measure_travel(i: int, walker: WalkerData, travel: Travel) -> None:
+    """Measures the body and its distance from the start."""
+    measure(i, walker)
+    x = walker.measurement.root[i, 0] - travel.origin[i, 0]
+    y = walker.measurement.root[i, 1] - travel.origin[i, 1]
+    travel.distance[i] = np.sqrt(x * x + y * y)
+
+
+@compiled
+def observe_body(i: int, columns: Any, walker: WalkerData, observation: np.ndarray) -> None:
+    """Writes the blocks terrain, pose and velocity; see `spatial_figure.body_blocks`."""
+    measurement = walker.measurement
+    if columns.terrain >= 0:
+        block = observation[i, columns.terrain : columns.terrain + SAMPLES * SAMPLES]
+        x, y = measurement.root[i, 0], measurement.root[i, 1]
+        spatial_ground.height_map(i, x, y, measurement.heading[i], walker.ground, block)
+    for k in range(measurement.pose.shape[1]):
+        observation[i, columns.pose + k] = measurement.pose[i, k]
+    for k in range(measurement.velocity.shape[1]):
+        observation[i, columns.velocity + k] = measurement.velocity[i, k]
+
+
+@compiled
+def observe_phase(i: int, columns: Any, clock: Clock, observation: np.ndarray) -> None:
+    """Writes the block `PHASE`."""
     if columns.phase >= 0:
-        phase = rules.clock.phase[i]
-        full[i, columns.phase] = phase
+        phase = clock.phase[i]
+        observation[i, columns.phase] = phase
         for k in range(PHASE_BINS):
-            full[i, columns.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
+            observation[i, columns.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
 
 
 # Its phase is that of the cycle; a mirrored observation has that of the step.
@@ -217,26 +204,49 @@ PHASE = Block(
 )  # fmt: skip
 
 
+@compiled_inline
+def in_left_stance(i: int, view: View) -> bool:
+    """Returns whether observation and action are reflected."""
+    return view.mirrored and view.full[i, view.columns.phase] >= 0.5
+
+
 @compiled
-def publish(i: int, rules: SpatialRules) -> None:
+def publish(i: int, view: View, outcome: Outcome) -> None:
     """Writes the observation from the full observation."""
-    given, full, observation = rules.given, rules.full, rules.outcome.observation
-    left = given.mirrored and full[i, given.phase] >= 0.5
-    for k in range(len(given.kept)):
-        column = given.kept[k]
+    full, observation, left = view.full, outcome.observation, in_left_stance(i, view)
+    for k in range(len(view.kept)):
+        column = view.kept[k]
         if left:
-            observation[i, k] = full[i, given.source[column]] * given.sign[column]
+            observation[i, k] = full[i, view.source[column]] * view.sign[column]
         else:
             observation[i, k] = full[i, column]
-    if given.mirrored:  # the phase of the single step
-        phase = full[i, given.phase]
-        observation[i, given.given_phase] = 2 * (phase - 0.5 if left else phase)
+    if view.mirrored:  # the phase of the single step
+        phase = full[i, view.columns.phase]
+        observation[i, view.given_phase] = 2 * (phase - 0.5 if left else phase)
+
+
+# Loops over simulations; they take packs, and return how many ground windows must be moved.
 
 
 @compiled_loop
-def act_all(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
-    """Applies actions; returns how many ground windows must be moved. Takes a pack."""
+def control_all(env_ids: np.ndarray, action: np.ndarray, walker: WalkerData) -> int:
+    """Applies actions."""
     leaving = 0
     for i in env_ids:
-        leaving += act(i, action, rules)
+        leaving += control(i, action, walker)
+    return leaving
+
+
+@compiled_loop
+def act_all(env_ids: np.ndarray, action: np.ndarray, walker: WalkerData, view: View) -> int:
+    """Applies actions, which are reflected in left stance if the view is mirrored."""
+    leaving = 0
+    for i in env_ids:
+        left = in_left_stance(i, view)
+        for k in range(view.action.shape[1]):
+            if left:
+                view.action[i, k] = action[i, view.action_source[k]] * view.action_sign[k]
+            else:
+                view.action[i, k] = action[i, k]
+        leaving += control(i, view.action, walker)
     return leaving

@@ -37,17 +37,17 @@ from trl_suite.tasks.components.plans import (
     Pushes,
     options,
 )
-from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP, act_all
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.footsteps.spatial_plans import Planner
 from trl_suite.tasks.footsteps.spatial_rules import (
     TERMS,
-    FootstepRules,
+    FootstepData,
     FootstepState,
     finish_all,
     land_all,
     observe_all,
 )
-from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
+from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
 from trl_suite.tasks.task import Marker
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
@@ -88,7 +88,7 @@ class SpatialFootstepsConfig(MirroredConfig):
             raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
 
 
-class SpatialFootsteps(SpatialTask):
+class SpatialFootsteps(TrackingTask):
     """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
@@ -140,7 +140,7 @@ class SpatialFootsteps(SpatialTask):
         self._heading_scale = float(config.heading_scale)
         self.plans: Plans = config.plans
         self.pushes: Pushes | None = config.pushes
-        self.steps, self.period = steps, 2 * steps.duration
+        self.steps = steps
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
         # The original has a limit of 1 m that has no effect.
         self.max_landing_error = config.max_landing_error
@@ -148,17 +148,15 @@ class SpatialFootsteps(SpatialTask):
         # Episodes start from the straight step whose length is nearest to the planned one.
         self._first = straight_step(steps, float(np.mean(self.plans.length)))
         super().__init__(
-            character, arena, steps, config, actuation_model=actuation_model,
+            character, arena, steps, typical_poses(steps, self._first), config,
+            period=2 * steps.duration, actuation_model=actuation_model,
             extras=(CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)),
             hidden=('contact', 'plan') if config.hidden_plan else (),
         )  # fmt: skip
 
-    def _typical_poses(self) -> np.ndarray:
-        return typical_poses(self.steps, self._first)
-
     def bind(self, world: World) -> None:
-        common, n = self._bind_rules(world), world.n
-        self.reference = SpatialReference.of_steps(self.steps, common.body, world.models[0])
+        view, n = self._bind_view(world), world.n
+        self.reference = SpatialReference.of_steps(self.steps, self.figure.body, world.models[0])
         self.plan = footstep_plan(n)
         self.state = FootstepState(
             np.zeros(n), np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros((n, 2)),
@@ -174,17 +172,20 @@ class SpatialFootsteps(SpatialTask):
             goals=self.goal_given, grace_steps=self._grace_steps,
         )  # fmt: skip
         limit = self.max_landing_error
-        rules = FootstepRules(
-            common=common,
+        data = FootstepData(
+            walker=self.walker,
+            seen=view,
+            clock=self.clock,
+            travel=self.travel,
+            period=self.period,
             comparison=comparison(self.character, self.reference, self.terms),
             plan=self.plan,
             state=self.state,
-            columns=self._extra_columns(),
             footstep_scales=self._footstep_scales,
             heading_scale=self._heading_scale,
             largest_miss=np.inf if limit is None else float(limit),
         )
-        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._pack = packed(data)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
 
     # Short names for the plan.
@@ -245,8 +246,7 @@ class SpatialFootsteps(SpatialTask):
     # A step.
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if act_all(env_ids, action, self._common_pack):
-            self._lay_ground(env_ids, self._common)
+        super().apply_action(action, env_ids)
         if self.pushes:
             self._push(env_ids, self.pushes)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from trl_suite.tasks.components.footstep_plan import (
 )
 from trl_suite.tasks.components.rewards import HEADING_WEIGHT, STEP_TERMS
 from trl_suite.tasks.components.spatial_rules import (
-    SpatialRules,
+    Clock,
+    Travel,
+    View,
+    WalkerData,
     breaks_down,
-    measure,
+    measure_travel,
     observe_body,
+    observe_phase,
     publish,
     tick,
 )
@@ -69,21 +73,23 @@ class FootstepState(NamedTuple):
     missed: np.ndarray
 
 
-class FootstepRules(NamedTuple):
+class FootstepData(NamedTuple):
     """Data for the compiled functions of footsteps.
 
     Attributes:
-      columns: first columns of the blocks contact, plan and goal in the full observation; -1: not
-        observed.
+      period: that of two steps, s.
       footstep_scales, heading_scale: factors of errors in the reward.
       largest_miss: landing error above which the episode fails, m.
     """
 
-    common: SpatialRules
+    walker: WalkerData
+    seen: View
+    clock: Clock
+    travel: Travel
+    period: float
     comparison: Comparison
     plan: FootstepPlan
     state: FootstepState
-    columns: Any
     footstep_scales: np.ndarray
     heading_scale: float
     largest_miss: float
@@ -93,30 +99,30 @@ class FootstepRules(NamedTuple):
 
 
 @compiled
-def land(i: int, rules: FootstepRules) -> bool:
+def land(i: int, data: FootstepData) -> bool:
     """Advances the clock, measures, and detects landings; returns whether a new plan is needed."""
-    common, plan, state = rules.common, rules.plan, rules.state
-    tick(i, common)
+    plan, state, clock = data.plan, data.state, data.clock
+    tick(i, data.period, clock)
     plan.landed[i] = state.missed[i] = False
-    if breaks_down(i, common):
+    if breaks_down(i, data.walker):
         return False
-    measure(i, common)
-    plan.landed[i] = update_stance(i, common.clock.phase[i], common.measurement, plan)
-    if plan.landed[i] and plan.landing_error[i] > rules.largest_miss:
-        state.missed[i] = common.clock.steps[i] > state.excused[i]
+    measure_travel(i, data.walker, data.travel)
+    plan.landed[i] = update_stance(i, clock.phase[i], data.walker.measurement, plan)
+    if plan.landed[i] and plan.landing_error[i] > data.largest_miss:
+        state.missed[i] = clock.steps[i] > state.excused[i]
     return plan.landed[i]
 
 
 @compiled
-def finish(i: int, rules: FootstepRules) -> None:
+def finish(i: int, data: FootstepData) -> None:
     """Computes reward, failure and observation."""
-    outcome = rules.common.outcome
+    outcome = data.walker.outcome
     if outcome.diverged[i]:  # keeps the last finite observation
         conclude(i, True, outcome)
         return
-    compare(i, rules)
-    conclude(i, rules.common.measurement.fallen[i] or rules.state.missed[i], outcome)
-    observe(i, rules)
+    compare(i, data)
+    conclude(i, data.walker.measurement.fallen[i] or data.state.missed[i], outcome)
+    observe(i, data)
 
 
 @compiled
@@ -126,11 +132,11 @@ def step_phase(phase: float) -> float:
 
 
 @compiled
-def compare(i: int, rules: FootstepRules) -> None:
+def compare(i: int, data: FootstepData) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
-    common, plan, comparison = rules.common, rules.plan, rules.comparison
-    measurement, state, tracks = common.measurement, rules.state, comparison.tracks
-    share = step_phase(common.clock.phase[i])
+    plan, state, comparison = data.plan, data.state, data.comparison
+    measurement, tracks = data.walker.measurement, comparison.tracks
+    share = step_phase(data.clock.phase[i])
     row, fraction = moment(share, state.track[i], tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     # The reference was aligned with the heading of the character at the switch of stance.
@@ -152,58 +158,58 @@ def compare(i: int, rules: FootstepRules) -> None:
             if k == 2:
                 off += feature(row, fraction, column, tracks)
             step += off * off
-    terms, outcome = comparison.terms, common.outcome
+    terms, outcome = comparison.terms, data.walker.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, com, terms.com, outcome)
     score(i, height, terms.root, outcome)
     end = 0.0
-    for scale in rules.footstep_scales:
+    for scale in data.footstep_scales:
         score(i, feet + scale * step, terms.end_effector, outcome)
         end += outcome.reward_terms[i, terms.end_effector.column]
-    outcome.reward_terms[i, terms.end_effector.column] = end / len(rules.footstep_scales)
+    outcome.reward_terms[i, terms.end_effector.column] = end / len(data.footstep_scales)
     off = abs(wrapped(plan.heading[i] - measurement.heading[i]))
-    give(i, facing(min(rules.heading_scale * off, math.pi)), terms.heading, outcome)
+    give(i, facing(min(data.heading_scale * off, math.pi)), terms.heading, outcome)
 
 
 @compiled
-def observe(i: int, rules: FootstepRules) -> None:
+def observe(i: int, data: FootstepData) -> None:
     """Writes the observation."""
-    common, measurement = rules.common, rules.common.measurement
-    observe_body(i, common)
-    columns = rules.columns
-    observe_plan(i, columns, measurement, rules.plan, common.full)
+    walker, columns, full = data.walker, data.seen.columns, data.seen.full
+    measurement = walker.measurement
+    observe_body(i, columns, walker, full)
+    observe_phase(i, columns, data.clock, full)
+    observe_plan(i, columns, measurement, data.plan, full)
     if columns.goal >= 0:
-        x = rules.state.goal[i, 0] - measurement.root[i, 0]
-        y = rules.state.goal[i, 1] - measurement.root[i, 1]
-        bearing, distance = polar(i, x, y, measurement)
-        common.full[i, columns.goal], common.full[i, columns.goal + 1] = bearing, distance
-    publish(i, common)
+        x = data.state.goal[i, 0] - measurement.root[i, 0]
+        y = data.state.goal[i, 1] - measurement.root[i, 1]
+        full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
+    publish(i, data.seen, walker.outcome)
 
 
 # Loops over simulations; they take packs.
 
 
 @compiled_loop
-def land_all(env_ids: np.ndarray, rules: FootstepRules) -> int:
+def land_all(env_ids: np.ndarray, data: FootstepData) -> int:
     """Detects landings; returns how many simulations need a new plan."""
     switched = 0
     for i in env_ids:
-        switched += land(i, rules)
+        switched += land(i, data)
     return switched
 
 
 @compiled_loop
-def finish_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+def finish_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish(i, rules)
+        finish(i, data)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+def observe_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
-        measure(i, rules.common)
-        compare(i, rules)
-        observe(i, rules)
+        measure_travel(i, data.walker, data.travel)
+        compare(i, data)
+        observe(i, data)

@@ -216,7 +216,7 @@ class PlanarImitation(Task):
             features=by_name(
                 'Features', {name: part.start for name, part in self.reference.columns.items()}
             ),
-            columns=columns(self.observed, self.blocks),
+            columns=columns(self.observed),
             terms=terms_data(self.terms),
             weights=np.asarray(spec.weights),
             rest=self._rest,

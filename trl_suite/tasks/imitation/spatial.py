@@ -28,15 +28,18 @@ from trl_suite.tasks.components.comparison import (
 )
 from trl_suite.tasks.components.goals import GOAL
 from trl_suite.tasks.components.spatial_rules import (
-    SpatialRules,
-    act_all,
+    Clock,
+    Travel,
+    View,
+    WalkerData,
     breaks_down,
     measure,
     observe_body,
+    observe_phase,
     publish,
     tick,
 )
-from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
+from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
 from trl_suite.tasks.task import conclude, drawn_seed
 from trl_suite.tasks.terms import score
 from trl_suite.terrain import SpatialGround
@@ -49,52 +52,50 @@ GOAL_AHEAD = (
 TYPICAL_POSES = 256  # poses of a cycle; their mean is action 0 of position control
 
 
-class ImitationRules(NamedTuple):
-    """Data for the compiled functions of imitation.
+class ImitationData(NamedTuple):
+    """Data for the compiled functions of imitation; `period`: that of the clip, s."""
 
-    Attributes:
-      columns: first columns of the blocks reference and goal in the full observation.
-    """
-
-    common: SpatialRules
+    walker: WalkerData
+    seen: View
+    clock: Clock
+    travel: Travel
+    period: float
     comparison: Comparison
-    columns: Any
 
 
 # A step of simulation i, in order.
 
 
 @compiled
-def finish_step(i: int, rules: ImitationRules) -> None:
+def finish_step(i: int, data: ImitationData) -> None:
     """Computes reward, failure and observation, after the physics was advanced."""
-    common = rules.common
-    tick(i, common)
-    if breaks_down(i, common):
-        conclude(i, True, common.outcome)
+    walker = data.walker
+    tick(i, data.period, data.clock)
+    if breaks_down(i, walker):
+        conclude(i, True, walker.outcome)
         return
-    look(i, rules)
-    compare(i, rules)
-    conclude(i, common.measurement.fallen[i], common.outcome)
-    observe(i, rules)
+    look(i, data)
+    compare(i, data)
+    conclude(i, walker.measurement.fallen[i], walker.outcome)
+    observe(i, data)
 
 
 @compiled
-def look(i: int, rules: ImitationRules) -> None:
-    """Measures the body; the distance travelled is that along +x."""
-    common = rules.common
-    measure(i, common)
-    common.travel.distance[i] = common.measurement.root[i, 0] - common.travel.origin[i, 0]
+def look(i: int, data: ImitationData) -> None:
+    """Measures the body, and the distance travelled along +x."""
+    measure(i, data.walker)
+    data.travel.distance[i] = data.walker.measurement.root[i, 0] - data.travel.origin[i, 0]
 
 
 @compiled
-def compare(i: int, rules: ImitationRules) -> None:
+def compare(i: int, data: ImitationData) -> None:
     """Writes the reward terms, from errors of pose, velocities and end effectors."""
-    comparison, measurement = rules.comparison, rules.common.measurement
-    row, fraction = moment(rules.common.clock.phase[i], 0, comparison.tracks)
+    comparison, measurement = data.comparison, data.walker.measurement
+    row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
     com = com_error(i, row, fraction, 0.0, comparison, measurement)
-    terms, outcome = comparison.terms, rules.common.outcome
+    terms, outcome = comparison.terms, data.walker.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, end_effector, terms.end_effector, outcome)
@@ -103,22 +104,23 @@ def compare(i: int, rules: ImitationRules) -> None:
 
 
 @compiled
-def observe(i: int, rules: ImitationRules) -> None:
+def observe(i: int, data: ImitationData) -> None:
     """Writes the observation."""
-    common, columns, full = rules.common, rules.columns, rules.common.full
-    observe_body(i, common)
+    walker, columns, full = data.walker, data.seen.columns, data.seen.full
+    observe_body(i, columns, walker, full)
+    observe_phase(i, columns, data.clock, full)
     if columns.reference >= 0:
-        tracks, features = rules.comparison.tracks, rules.comparison.columns
-        row, fraction = moment(common.clock.phase[i], 0, tracks)
+        tracks, features = data.comparison.tracks, data.comparison.columns
+        row, fraction = moment(data.clock.phase[i], 0, tracks)
         full[i, columns.reference] = feature(row, fraction, features.height, tracks)
-        for k in range(6 * len(common.body.links)):  # positions and velocities of the links
+        for k in range(6 * len(walker.body.links)):  # positions and velocities of the links
             value = feature(row, fraction, features.positions + k, tracks)
             full[i, columns.reference + 1 + k] = value
-    aside = common.travel.origin[i, 1] - common.measurement.root[i, 1]
+    aside = data.travel.origin[i, 1] - walker.measurement.root[i, 1]
     full[i, columns.goal], full[i, columns.goal + 1] = polar(
-        i, GOAL_AHEAD, aside, common.measurement
+        i, GOAL_AHEAD, aside, walker.measurement
     )
-    publish(i, common)
+    publish(i, data.seen, walker.outcome)
 
 
 def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
@@ -140,19 +142,19 @@ def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
 
 
 @compiled_loop
-def finish_steps(env_ids: np.ndarray, rules: ImitationRules) -> None:
+def finish_steps(env_ids: np.ndarray, data: ImitationData) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish_step(i, rules)
+        finish_step(i, data)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, rules: ImitationRules) -> None:
+def observe_all(env_ids: np.ndarray, data: ImitationData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
-        look(i, rules)
-        compare(i, rules)
-        observe(i, rules)
+        look(i, data)
+        compare(i, data)
+        observe(i, data)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -164,7 +166,7 @@ class SpatialImitationConfig(MirroredConfig):
     )
 
 
-class SpatialImitation(SpatialTask):
+class SpatialImitation(TrackingTask):
     """A spatial character tracks a looping clip along +x, over random terrain.
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
@@ -210,24 +212,26 @@ class SpatialImitation(SpatialTask):
           ValueError: incompatible options, or a clip that does not fit the character.
         """
         check_cycle(clip)
-        self.clip, self.period = clip, clip.duration
-        seen = config.reference_observation
-        extras = motion_blocks(len(character.spec.links), seen)
+        self.clip, seen = clip, config.reference_observation
         super().__init__(
-            character, arena, clip, config, actuation_model=actuation_model, phase=not seen,
-            extras=extras,
+            character, arena, clip, cycle_poses(clip), config, period=clip.duration,
+            actuation_model=actuation_model, phase=not seen,
+            extras=motion_blocks(len(character.spec.links), seen),
         )  # fmt: skip
 
-    def _typical_poses(self) -> np.ndarray:
-        return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
-
     def bind(self, world: World) -> None:
-        common = self._bind_rules(world)
-        self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
-        rules = ImitationRules(
-            common, comparison(self.character, self.reference, self.terms), self._extra_columns()
+        view = self._bind_view(world)
+        self.reference = SpatialReference.of_clip(self.clip, self.figure.body, world.models[0])
+        self._pack = packed(
+            ImitationData(
+                walker=self.walker,
+                seen=view,
+                clock=self.clock,
+                travel=self.travel,
+                period=self.period,
+                comparison=comparison(self.character, self.reference, self.terms),
+            )
         )
-        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
@@ -244,10 +248,6 @@ class SpatialImitation(SpatialTask):
             self.arena.begin_episode(i, ground)
         self._begin_clocks(env_ids)
         return *pose_of_clip(self.clip, self.clock.start[env_ids]), np.zeros((len(env_ids), 3))
-
-    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if act_all(env_ids, action, self._common_pack):
-            self._lay_ground(env_ids, self._common)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         finish_steps(env_ids, self._pack)
@@ -290,6 +290,11 @@ def check_cycle(clip: Clip) -> None:
         )
 
 
+def cycle_poses(clip: Clip) -> np.ndarray:
+    """Returns poses of a cycle, whose mean is action 0 of position control, (k, columns)."""
+    return clip.pose(np.linspace(0, clip.duration, TYPICAL_POSES, endpoint=False))
+
+
 def pose_of_clip(clip: Clip, cycles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns poses with x = y = 0, and rates, of a clip at times in cycles (m,)."""
     poses, rates = clip.state(cycles * clip.duration)
@@ -297,7 +302,7 @@ def pose_of_clip(clip: Clip, cycles: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return poses, rates
 
 
-def clip_action(task: SpatialTask, clip: Clip, env_id: int) -> np.ndarray:
+def clip_action(task: TrackingTask, clip: Clip, env_id: int) -> np.ndarray:
     """Returns the action that moves the joints along a clip, in open loop.
 
     Raises:

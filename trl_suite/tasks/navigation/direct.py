@@ -29,23 +29,23 @@ from trl_suite.tasks.components.ball import (
 from trl_suite.tasks.components.comparison import comparison
 from trl_suite.tasks.components.goal_drawer import GoalDrawer
 from trl_suite.tasks.components.goals import GOAL, flag, goals
-from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, act_all
+from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP
 from trl_suite.tasks.components.trace import trace, trace_markers
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
-from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
+from trl_suite.tasks.imitation.spatial import check_cycle, clip_action, cycle_poses, pose_of_clip
 from trl_suite.tasks.navigation.direct_rules import (
     BALL_SHARE,
     GOAL_REACHED,
     HIDDEN_LENGTH,
     REWARDS,
-    DirectRules,
+    DirectData,
     Progress,
+    advance_all,
     direct_terms,
     finish_all,
     observe_all,
-    travel_all,
 )
-from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask
+from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask
 from trl_suite.tasks.task import Marker
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
@@ -80,7 +80,7 @@ class DirectNavigationConfig(DirectConfig):
             raise ValueError("goal_reached is an option of the reward 'goal', not of 'original'")
 
 
-class DirectNavigation(SpatialTask):
+class DirectNavigation(TrackingTask):
     """A spatial character imitates a clip while it walks, or dribbles a ball, from goal to goal.
 
     The reward is that of imitation, with the clip's velocity rotated towards the goal, and
@@ -120,7 +120,7 @@ class DirectNavigation(SpatialTask):
           ValueError: incompatible options, or a clip that does not fit the character.
         """
         check_cycle(clip)
-        self.clip, self.period, self.ball = clip, clip.duration, ball
+        self.clip, self.ball = clip, ball
         self.terms = direct_terms(1.0, 'goal')
         if ball:
             self.terms = *direct_terms(1 - BALL_SHARE, 'ball'), *soccer_terms(BALL_SHARE)
@@ -128,16 +128,14 @@ class DirectNavigation(SpatialTask):
         self.goal_reached = GOAL_REACHED if reached is None else float(reached)
         self._goal_drawer = GoalDrawer(arena, ball, 'near')
         super().__init__(
-            character, arena, clip, config, actuation_model=actuation_model,
+            character, arena, clip, cycle_poses(clip), config, period=clip.duration,
+            actuation_model=actuation_model,
             extras=(BALL_GOAL if ball else GOAL, BALL.observed_if(ball is not None)),
         )  # fmt: skip
 
-    def _typical_poses(self) -> np.ndarray:
-        return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
-
     def bind(self, world: World) -> None:
-        common, n = self._bind_rules(world), world.n
-        self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
+        view, n = self._bind_view(world), world.n
+        self.reference = SpatialReference.of_clip(self.clip, self.figure.body, world.models[0])
         self.goals, self.progress, self.trace = goals(n), Progress(np.zeros(n)), trace(n)
         self.saved = (*self.saved, self.goals, self.progress, self.trace)
         self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
@@ -148,18 +146,21 @@ class DirectNavigation(SpatialTask):
             balls = self.ball.rules(SPEED, self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        rules = DirectRules(
-            common=common,
+        data = DirectData(
+            walker=self.walker,
+            seen=view,
+            clock=self.clock,
+            travel=self.travel,
+            period=self.period,
             comparison=comparison(self.character, self.reference, self.terms),
             goals=self.goals,
             progress=self.progress,
             trace=self.trace,
-            columns=self._extra_columns(),
             goal_reached=self.goal_reached,
             with_ball=self.ball is not None,
             ball=balls,
         )
-        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._pack = packed(data)
 
     @property
     def goal(self) -> np.ndarray:
@@ -186,12 +187,8 @@ class DirectNavigation(SpatialTask):
 
     # A step.
 
-    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if act_all(env_ids, action, self._common_pack):
-            self._lay_ground(env_ids, self._common)
-
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if travel_all(env_ids, self._pack):
+        if advance_all(env_ids, self._pack):
             self._goal_drawer.redraw(env_ids, self.figure.measurement.root[:, :2])
         finish_all(env_ids, self._pack)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,14 @@ from trl_suite.tasks.components.goals import Goals
 from trl_suite.tasks.components.rewards import tracking_terms
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
-    SpatialRules,
+    Clock,
+    Travel,
+    View,
+    WalkerData,
     breaks_down,
-    measure,
+    measure_travel,
     observe_body,
+    observe_phase,
     publish,
     tick,
 )
@@ -66,87 +70,83 @@ class Progress(NamedTuple):
     speed: np.ndarray
 
 
-class DirectRules(NamedTuple):
+class DirectData(NamedTuple):
     """Data for the compiled functions of direct navigation.
 
     Attributes:
-      columns: first columns of the blocks goal and ball in the full observation; -1: not observed.
+      period: that of the clip, s.
       goal_reached: distance of the root within which the goal is reached, m.
       with_ball: whether the goal is that of a ball.
     """
 
-    common: SpatialRules
+    walker: WalkerData
+    seen: View
+    clock: Clock
+    travel: Travel
+    period: float
     comparison: Comparison
     goals: Goals
     progress: Progress
     trace: Trace
-    columns: Any
     goal_reached: float
     with_ball: bool
     ball: BallRules
 
 
-# A step of simulation i: `travel`, the next goal if one is needed, `finish`.
+# A step of simulation i: `advance`, the next goal if one is needed, `finish`.
 
 
 @compiled
-def travel(i: int, rules: DirectRules) -> bool:
+def advance(i: int, data: DirectData) -> bool:
     """Measures the body and tests goal and ball; returns whether one of them must be redrawn."""
-    common, goals, state = rules.common, rules.goals, rules.ball.state
-    tick(i, common)
+    walker, goals, state = data.walker, data.goals, data.ball.state
+    tick(i, data.period, data.clock)
     goals.wanted[i] = state.wanted[i] = False
-    if breaks_down(i, common):
+    if breaks_down(i, walker):
         return False
-    measure(i, common)
-    count, measurement = common.clock.steps[i], common.measurement
-    follow(i, count, measurement.com, rules.trace)
-    if rules.with_ball:
+    measure_travel(i, walker, data.travel)
+    count, measurement = data.clock.steps[i], walker.measurement
+    follow(i, count, measurement.com, data.trace)
+    if data.with_ball:
         dribble(
-            i,
-            CONTROL_TIMESTEP,
-            goals.place,
-            common.physics,
-            measurement,
-            rules.ball,
-            common.outcome,
+            i, CONTROL_TIMESTEP, goals.place, walker.physics, measurement, data.ball, walker.outcome
         )
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
         goals.wanted[i] = count >= goals.due[i]  # a ball's goal is not redrawn when it is reached
     else:
-        x, y = (
-            goals.place[i, 0] - measurement.root[i, 0],
-            goals.place[i, 1] - measurement.root[i, 1],
-        )
-        reached = x * x + y * y < rules.goal_reached * rules.goal_reached
+        x = goals.place[i, 0] - measurement.root[i, 0]
+        y = goals.place[i, 1] - measurement.root[i, 1]
+        reached = x * x + y * y < data.goal_reached * data.goal_reached
         goals.wanted[i] = reached or count >= goals.due[i]
     goals.reached[i] += reached
     return goals.wanted[i] or state.wanted[i]
 
 
 @compiled
-def finish(i: int, rules: DirectRules) -> None:
+def finish(i: int, data: DirectData) -> None:
     """Computes reward, failure and observation."""
-    common = rules.common
-    if common.outcome.diverged[i]:  # keeps the last finite observation
-        conclude(i, True, common.outcome)
+    walker = data.walker
+    if walker.outcome.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, walker.outcome)
         return
-    if rules.with_ball:
-        remember(i, common.physics, common.measurement, rules.ball)
-    compare(i, rules)
-    conclude(i, common.measurement.fallen[i], common.outcome)
-    observe(i, rules)
+    if data.with_ball:
+        remember(i, walker.physics, walker.measurement, data.ball)
+    compare(i, data)
+    conclude(i, walker.measurement.fallen[i], walker.outcome)
+    observe(i, data)
 
 
 @compiled
-def compare(i: int, rules: DirectRules) -> None:
+def compare(i: int, data: DirectData) -> None:
     """Writes the reward terms: imitation while walking to the goal, or to the ball."""
-    common, comparison, measurement = rules.common, rules.comparison, rules.common.measurement
-    row, fraction = moment(common.clock.phase[i], 0, comparison.tracks)
-    if rules.with_ball:
-        x, y = common.physics.qpos[i, rules.ball.qpos], common.physics.qpos[i, rules.ball.qpos + 1]
+    walker, comparison, measurement = data.walker, data.comparison, data.walker.measurement
+    row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
+    if data.with_ball:
+        qpos, first = walker.physics.qpos, data.ball.qpos
+        x, y = qpos[i, first], qpos[i, first + 1]
     else:
-        x, y = rules.goals.place[i, 0], rules.goals.place[i, 1]
+        x, y = data.goals.place[i, 0], data.goals.place[i, 1]
     x, y = x - measurement.root[i, 0], y - measurement.root[i, 1]
     squared = x * x + y * y
     distance, direction = math.sqrt(squared), math.atan2(y, x)
@@ -155,7 +155,7 @@ def compare(i: int, rules: DirectRules) -> None:
     off = 0.0 if near else wrapped(direction - measurement.heading[i])
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
-    terms, outcome = comparison.terms, common.outcome
+    terms, outcome = comparison.terms, walker.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, end_effector, terms.end_effector, outcome)
@@ -164,54 +164,52 @@ def compare(i: int, rules: DirectRules) -> None:
     give(i, facing(off), terms.heading, outcome)
     score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
     along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
-    rules.progress.speed[i] = along / max(distance, 1e-9)
+    data.progress.speed[i] = along / max(distance, 1e-9)
 
 
 @compiled
-def observe(i: int, rules: DirectRules) -> None:
+def observe(i: int, data: DirectData) -> None:
     """Writes the observation."""
-    common, measurement = rules.common, rules.common.measurement
-    observe_body(i, common)
-    columns, place = rules.columns, rules.goals.place
-    if rules.with_ball:
-        physics, measurement = common.physics, common.measurement
-        observe_ball(i, columns, place, physics, measurement, rules.ball, common.full)
+    walker, columns, full = data.walker, data.seen.columns, data.seen.full
+    measurement, place = walker.measurement, data.goals.place
+    observe_body(i, columns, walker, full)
+    observe_phase(i, columns, data.clock, full)
+    if data.with_ball:
+        observe_ball(i, columns, place, walker.physics, measurement, data.ball, full)
     else:
-        x = place[i, 0] - common.measurement.root[i, 0]
-        y = place[i, 1] - common.measurement.root[i, 1]
-        bearing, distance = polar(i, x, y, common.measurement)
-        common.full[i, columns.goal], common.full[i, columns.goal + 1] = bearing, distance
-    publish(i, common)
+        x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
+        full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
+    publish(i, data.seen, walker.outcome)
 
 
 # Loops over simulations; they take packs.
 
 
 @compiled_loop
-def travel_all(env_ids: np.ndarray, rules: DirectRules) -> int:
+def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     """Tests goals and balls; returns in how many simulations one must be redrawn."""
     wanted = 0
     for i in env_ids:
-        wanted += travel(i, rules)
+        wanted += advance(i, data)
     return wanted
 
 
 @compiled_loop
-def finish_all(env_ids: np.ndarray, rules: DirectRules) -> None:
+def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish(i, rules)
+        finish(i, data)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, fresh: bool, rules: DirectRules) -> None:
+def observe_all(env_ids: np.ndarray, fresh: bool, data: DirectData) -> None:
     """Measures, writes reward terms for the current state, and observes.
 
     If `fresh`, episodes have just begun, and positions of ball and walker are stored.
     """
     for i in env_ids:
-        measure(i, rules.common)
-        if fresh and rules.with_ball:
-            remember(i, rules.common.physics, rules.common.measurement, rules.ball)
-        compare(i, rules)
-        observe(i, rules)
+        measure_travel(i, data.walker, data.travel)
+        if fresh and data.with_ball:
+            remember(i, data.walker.physics, data.walker.measurement, data.ball)
+        compare(i, data)
+        observe(i, data)

@@ -41,9 +41,10 @@ from trl_suite.tasks.components.goals import GOAL, flag, goals
 from trl_suite.tasks.components.plans import Plans, span
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
+    PHASE,
     SUBSTEPS,
     TERRAIN_MAPS,
-    act_all,
+    control_all,
 )
 from trl_suite.tasks.components.trace import trace, trace_markers
 from trl_suite.tasks.navigation.hierarchical_rules import (
@@ -53,7 +54,8 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     MAPS,
     NAVIGATION_TERMS,
     SURFACE,
-    PlanningRules,
+    ControllerData,
+    PlanningData,
     PlanningState,
     begin_steps,
     finish_all,
@@ -61,7 +63,6 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     observe_all,
     score_all,
     show_plans,
-    take_all,
 )
 from trl_suite.tasks.navigation.plan_actions import (
     INTERFACES,
@@ -70,7 +71,7 @@ from trl_suite.tasks.navigation.plan_actions import (
     plan_action_map,
     planning_mirror,
 )
-from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask, maps
+from trl_suite.tasks.spatial_task import SpatialTask, maps
 from trl_suite.tasks.task import (
     MOST_SUBSTEPS,
     TERRAIN_LEVEL,
@@ -194,33 +195,31 @@ class HierarchicalNavigation(SpatialTask):
           ValueError: parts that are incompatible.
         """
         check_two_feet(character.spec)
-        interface, step_length = config.interface, config.step_length
-        self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
+        self.steps, self.ball = steps, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
         self.terms = soccer_terms() if ball else NAVIGATION_TERMS
         super().__init__(
-            character, arena, steps, SpatialConfig(substeps=config.substeps),
-            extras=(CONTACT, PLAN),
+            character, arena, steps, typical_poses(steps, self._first), config,
+            period=2 * steps.duration,
         )  # fmt: skip
+        self._seen = *self.figure.blocks, PHASE, CONTACT, PLAN  # by the footstep controller
         self.controller = footstep_controller.load(config.controller)
-        self.controller.check(self)
+        self.controller.check(character.spec, layout(self._seen), self.joint_map)
         # A custom function is called on one thread, for all simulations together.
         self.in_parts = self.controller.policy is not None
-        self.config, self.interface, self.step_length = config, interface, step_length
+        self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
             (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
         self._goal_drawer = GoalDrawer(arena, ball, 'far', config.goal_distance)
-        self._frame = config.substeps
-        if interface == 'plan':
+        by_plan = self.interface == 'plan'
+        if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
-        self.action_map = plan_action_map(
-            step_length, self.joint_map if interface == 'frame' else None
-        )
+        self.action_map = plan_action_map(self.step_length, None if by_plan else self.joint_map)
         terrain, pose, velocity = body_blocks(character, 'height' in config.terrain_observation)
-        low = Block(
-            'low_level', sum(block.size for block in self.full), '',
+        controller = Block(
+            'low_level', sum(block.size for block in self._seen), '',
             'observation of the footstep controller', 'the footstep controller has its own observation',
         )  # fmt: skip
         self.observed = (
@@ -230,25 +229,22 @@ class HierarchicalNavigation(SpatialTask):
             velocity,
             BALL_GOAL if ball else GOAL,
             BALL.observed_if(ball is not None),
-            low.observed_if(interface == 'frame'),
+            controller.observed_if(not by_plan),
         )
-        self.blocks = layout(self.observed)
-        mirrors = interface == 'plan' and self.character.spec.mirror
-        self.mirror = planning_mirror(character, self.observed) if mirrors else None
+        if by_plan and character.spec.mirror:
+            self.mirror = planning_mirror(character, self.observed)
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
 
-    def _typical_poses(self) -> np.ndarray:
-        return typical_poses(self.steps, self._first)
-
     def bind(self, world: World) -> None:
-        common, n = self._bind_rules(world), world.n
+        self._bind_walker(world)
+        n = world.n
         self.plan, self.goals, self.trace = footstep_plan(n), goals(n), trace(n)
         self.state = PlanningState(
             np.zeros(n, int), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
-            np.zeros((n, len(self.action_map))), np.zeros(n, bool),
+            np.zeros(n, bool),
         )  # fmt: skip
         self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
         self.info_arrays |= {
@@ -266,16 +262,33 @@ class HierarchicalNavigation(SpatialTask):
             balls = self.ball.rules(float(self.config.target_speed), self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        rules = PlanningRules(
-            common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
-            low_columns=self._extra_columns(), columns=columns(self.observed, self.blocks),
-            terms=terms_data(NAVIGATION_TERMS), by_plan=self.interface == 'plan',
-            plan_offset=self.action_map.action_offset, plan_scale=self.action_map.action_scale,
-            target_speed=float(self.config.target_speed), goal_reached=self.goal_reached,
-            with_ball=self.ball is not None, ball=balls,
-        )  # fmt: skip
-        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
-        self._low_action = np.zeros((n, len(self.joint_map)))
+        seen = ControllerData(
+            columns(self._seen), np.zeros((n, sum(block.size for block in self._seen)))
+        )
+        self._controller_observation = seen.observation
+        self._joint_action = np.zeros((n, len(self.joint_map)))
+        self._pack = packed(
+            PlanningData(
+                walker=self.walker,
+                clock=self.clock,
+                travel=self.travel,
+                period=self.period,
+                controller=seen,
+                plan=self.plan,
+                goals=self.goals,
+                state=self.state,
+                trace=self.trace,
+                columns=columns(self.observed),
+                terms=terms_data(NAVIGATION_TERMS),
+                by_plan=self.interface == 'plan',
+                plan_offset=self.action_map.action_offset,
+                plan_scale=self.action_map.action_scale,
+                target_speed=float(self.config.target_speed),
+                goal_reached=self.goal_reached,
+                with_ball=self.ball is not None,
+                ball=balls,
+            )
+        )
 
     # Short names for state.
 
@@ -344,33 +357,27 @@ class HierarchicalNavigation(SpatialTask):
 
     @property
     def steps_per_call(self) -> int:
-        return self._frame
+        return self.config.substeps
 
     # A step.
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        take_all(env_ids, action, self._pack)
+        begin_steps(env_ids, action, self._pack)
+        if self.interface == 'frame':
+            self._joint_action[env_ids] = np.clip(action[env_ids, len(PLAN_NAMES) :], -1.0, 1.0)
 
     def simulate(self, env_ids: np.ndarray) -> None:
         """Runs each simulation to the next switch of stance, or for one control step."""
-        if not len(env_ids):
-            return
-        by_plan = self.interface == 'plan'
-        begin_steps(env_ids, self._pack)
         going = env_ids
-        while True:
-            if by_plan:
-                self._low_action[going] = self.controller(self._common.full[going])
-            else:
-                self._low_action[going] = self.state.action[going, len(PLAN_NAMES) :]
-            if act_all(going, self._low_action, self._common_pack):
-                self._lay_ground(going, self._common)
-            self.world.step(self._frame, going)
+        while len(going):
+            if self.interface == 'plan':
+                self._joint_action[going] = self.controller(self._controller_observation[going])
+            if control_all(going, self._joint_action, self._walker_pack):
+                self._lay_ground(going)
+            self.world.step(self.config.substeps, going)
             count = finish_control_steps(going, self._pack)
             if self.watch is not None:
                 self.watch()
-            if not count:
-                return
             if count < len(going):
                 going = going[~self.state.over[going]]
 
@@ -388,10 +395,8 @@ class HierarchicalNavigation(SpatialTask):
         Raises:
           ValueError: actions of the wrong shape, or with NaN or infinity.
         """
-        everyone = self.world.all_ids
-        self.apply_action(self.action_map.checked(action, self.world.n), everyone)
-        show_plans(everyone, self._pack)
-        return self._common.full.copy()
+        show_plans(self.world.all_ids, self.action_map.checked(action, self.world.n), self._pack)
+        return self._controller_observation.copy()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])

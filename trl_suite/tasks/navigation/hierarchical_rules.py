@@ -22,13 +22,15 @@ from trl_suite.tasks.components.footstep_plan import (
     update_stance,
 )
 from trl_suite.tasks.components.goals import Goals
-from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
-    SpatialRules,
+    Clock,
+    Travel,
+    WalkerData,
     breaks_down,
-    measure,
+    measure_travel,
     observe_body,
+    observe_phase,
     tick,
 )
 from trl_suite.tasks.components.trace import Trace, follow
@@ -36,7 +38,7 @@ from trl_suite.tasks.task import conclude
 from trl_suite.tasks.terms import Term, give
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
 
 CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
 MAPS = ('height', 'velocity')
@@ -80,7 +82,6 @@ class PlanningState(NamedTuple):
       begin: position of the centre of mass at its beginning, (n, 3) m.
       down: decaying average of samples with a fall link on the ground.
       speed: mean speed of walker or ball towards the goal in the last step, m/s.
-      action: clipped action, (n, k).
       over: whether the step is over.
     """
 
@@ -89,17 +90,22 @@ class PlanningState(NamedTuple):
     begin: np.ndarray
     down: np.ndarray
     speed: np.ndarray
-    action: np.ndarray
     over: np.ndarray
 
 
-class PlanningRules(NamedTuple):
+class ControllerData(NamedTuple):
+    """What the footstep controller observes: columns of the blocks, and observations (n, size)."""
+
+    columns: Any
+    observation: np.ndarray
+
+
+class PlanningData(NamedTuple):
     """Data for the compiled functions of navigation by planned footsteps.
 
-    The full observation of `common` is the observation of the footstep controller.
-
     Attributes:
-      low_columns: first columns of the blocks contact and plan in the full observation.
+      period: that of two footsteps, s.
+      controller: the observation of the footstep controller.
       columns: first columns of the blocks of the observation; -1: not observed.
       terms: the reward terms of a goal.
       by_plan: whether a step is a footstep, not a control step.
@@ -108,12 +114,15 @@ class PlanningRules(NamedTuple):
       with_ball: whether the goal is that of a ball.
     """
 
-    common: SpatialRules
+    walker: WalkerData
+    clock: Clock
+    travel: Travel
+    period: float
+    controller: ControllerData
     plan: FootstepPlan
     goals: Goals
     state: PlanningState
     trace: Trace
-    low_columns: Any
     columns: Any
     terms: Any
     by_plan: bool
@@ -131,95 +140,95 @@ class PlanningRules(NamedTuple):
 
 
 @compiled
-def begin_step(i: int, rules: PlanningRules) -> None:
+def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan if a footstep begins, and writes the footstep controller's observation."""
-    common, state = rules.common, rules.state
-    measure(i, common)
-    lay_plan(i, rules)
+    walker, state = data.walker, data.state
+    measure_travel(i, walker, data.travel)
+    lay_plan(i, action, data)
     state.lasted[i] = 0
     for k in range(3):
-        state.begin[i, k] = common.measurement.com[i, k]
-    if rules.with_ball:
-        remember(i, common.physics, common.measurement, rules.ball)
-    rules.plan.landed[i] = False
-    observe_low(i, rules)
+        state.begin[i, k] = walker.measurement.com[i, k]
+    if data.with_ball:
+        remember(i, walker.physics, walker.measurement, data.ball)
+    data.plan.landed[i] = False
+    observe_for_controller(i, data)
 
 
 @compiled
-def lay_plan(i: int, rules: PlanningRules) -> None:
+def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan from the action, relative to the root and its heading, if a footstep begins."""
-    plan, measurement, ground = rules.plan, rules.common.measurement, rules.common.ground
-    if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
+    plan, measurement, ground = data.plan, data.walker.measurement, data.walker.ground
+    if not (data.by_plan or plan.landed[i] or data.clock.steps[i] == 0):
         return
     heading = measurement.heading[i]
     cosine, sine = math.cos(heading), math.sin(heading)
     for which in range(2):
-        ahead, left = meant(i, 2 * which, rules), meant(i, 2 * which + 1, rules)
+        ahead, left = meant(i, 2 * which, action, data), meant(i, 2 * which + 1, action, data)
         x = measurement.root[i, 0] + (cosine * ahead - sine * left)
         y = measurement.root[i, 1] + (sine * ahead + cosine * left)
         plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
         plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
-    plan.heading[i] = heading + meant(i, 4, rules)
+    plan.heading[i] = heading + meant(i, 4, action, data)
+
+
+@compiled_inline
+def meant(i: int, k: int, action: np.ndarray, data: PlanningData) -> float:
+    """Returns number k of the action, clipped, in physical units, m or rad."""
+    return min(max(action[i, k], -1.0), 1.0) * data.plan_scale[k] + data.plan_offset[k]
 
 
 @compiled
-def meant(i: int, k: int, rules: PlanningRules) -> float:
-    """Returns number k of the action in physical units, m or rad."""
-    return rules.state.action[i, k] * rules.plan_scale[k] + rules.plan_offset[k]
+def observe_for_controller(i: int, data: PlanningData) -> None:
+    """Writes the observation of the footstep controller, as in `SpatialFootsteps`."""
+    walker, columns, observation = data.walker, data.controller.columns, data.controller.observation
+    observe_body(i, columns, walker, observation)
+    observe_phase(i, columns, data.clock, observation)
+    observe_plan(i, columns, walker.measurement, data.plan, observation)
 
 
 @compiled
-def observe_low(i: int, rules: PlanningRules) -> None:
-    """Writes the observation of the footstep controller."""
-    common = rules.common
-    observe_body(i, common)
-    observe_plan(i, rules.low_columns, common.measurement, rules.plan, common.full)
-
-
-@compiled
-def finish_control_step(i: int, rules: PlanningRules) -> bool:
+def finish_control_step(i: int, data: PlanningData) -> bool:
     """Finishes a control step within a step: clock, divergence, measurement, falls, landings.
 
     Returns:
       Whether the step continues; the observation of the footstep controller is then written.
     """
-    common, state, outcome = rules.common, rules.state, rules.common.outcome
-    tick(i, common)
+    walker, state, outcome, plan = data.walker, data.state, data.walker.outcome, data.plan
+    tick(i, data.period, data.clock)
     state.lasted[i] += 1
-    if breaks_down(i, common):
+    if breaks_down(i, walker):
         outcome.failed[i] = state.over[i] = True
         return False
-    measure(i, common)
-    count, measurement = common.clock.steps[i], common.measurement
+    measure_travel(i, walker, data.travel)
+    count, measurement = data.clock.steps[i], walker.measurement
     if count % SAMPLE_FRAMES == 0:
         state.down[i] *= CONTACT_DECAY
         state.down[i] += CONTACT_GAIN * measurement.fallen[i]
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
-    if update_stance(i, common.clock.phase[i], measurement, rules.plan):
-        rules.plan.landed[i] = True
-    follow(i, count, measurement.com, rules.trace)
+    if update_stance(i, data.clock.phase[i], measurement, plan):
+        plan.landed[i] = True
+    follow(i, count, measurement.com, data.trace)
     state.over[i] = (
-        rules.plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST
-        or not rules.by_plan
-    )  # fmt: skip
+        plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST or not data.by_plan
+    )
     if not state.over[i]:
-        observe_low(i, rules)
+        observe_for_controller(i, data)
     return not state.over[i]
 
 
 @compiled
-def score(i: int, rules: PlanningRules) -> bool:
+def score(i: int, data: PlanningData) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
-    common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
-    measurement, outcome = common.measurement, common.outcome
+    walker, goals, state, ball = data.walker, data.goals, data.state, data.ball.state
+    measurement, outcome = walker.measurement, walker.outcome
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
     goals.wanted[i] = ball.wanted[i] = False
-    if common.outcome.diverged[i]:
+    if outcome.diverged[i]:
         return False
-    if rules.with_ball:
+    if data.with_ball:
         state.speed[i] = dribble(
-            i, seconds, goals.place, common.physics, measurement, rules.ball, outcome
+            i, seconds, goals.place, walker.physics, measurement, data.ball, outcome
         )
     else:
         x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
@@ -229,17 +238,17 @@ def score(i: int, rules: PlanningRules) -> bool:
             measurement.com[i, 1] - state.begin[i, 1],
         )
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
-        lack = min(speed - rules.target_speed, 0.0)
-        full = distance < rules.goal_reached
+        lack = min(speed - data.target_speed, 0.0)
+        full = distance < data.goal_reached
         worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
-        give(i, worth, rules.terms.speed, outcome)
-        give(i, 1.0, rules.terms.upright, outcome)
+        give(i, worth, data.terms.speed, outcome)
+        give(i, 1.0, data.terms.upright, outcome)
         state.speed[i] = speed
-    if common.outcome.failed[i]:
+    if outcome.failed[i]:
         return False
-    count = common.clock.steps[i]
+    count = data.clock.steps[i]
     late = count >= goals.due[i]
-    if rules.with_ball:  # a ball's goal is not redrawn when it is reached
+    if data.with_ball:  # a ball's goal is not redrawn when it is reached
         goals.reached[i] += ball.at_goal[i]
         ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
     else:
@@ -247,100 +256,91 @@ def score(i: int, rules: PlanningRules) -> bool:
             goals.place[i, 0] - measurement.root[i, 0],
             goals.place[i, 1] - measurement.root[i, 1],
         )
-        reached = math.hypot(x, y) < rules.goal_reached
+        reached = math.hypot(x, y) < data.goal_reached
         goals.reached[i] += reached
         goals.wanted[i] = reached or late
     return goals.wanted[i] or ball.wanted[i]
 
 
 @compiled
-def finish(i: int, rules: PlanningRules) -> None:
+def finish(i: int, data: PlanningData) -> None:
     """Computes reward and observation."""
-    outcome = rules.common.outcome
+    outcome = data.walker.outcome
     conclude(i, outcome.failed[i], outcome)
     if not outcome.diverged[i]:  # otherwise keeps the last finite observation
-        observe(i, rules)
+        observe(i, data)
 
 
 @compiled
-def observe(i: int, rules: PlanningRules) -> None:
+def observe(i: int, data: PlanningData) -> None:
     """Writes the observation."""
-    common, measurement, columns = rules.common, rules.common.measurement, rules.columns
-    observation = common.outcome.observation
-    write_terrain(i, columns.terrain, common.ground, measurement, observation)
+    walker, measurement, columns = data.walker, data.walker.measurement, data.columns
+    observation, place = walker.outcome.observation, data.goals.place
+    observe_body(i, columns, walker, observation)
     if columns.surface >= 0:
         block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
         x, y = measurement.root[i, 0], measurement.root[i, 1]
-        spatial_ground.velocity_map(i, x, y, measurement.heading[i], common.ground, block)
-    write_body(i, columns.pose, columns.velocity, measurement, observation)
-    place = rules.goals.place
-    if rules.with_ball:
-        observe_ball(i, columns, place, common.physics, measurement, rules.ball, observation)
+        spatial_ground.velocity_map(i, x, y, measurement.heading[i], walker.ground, block)
+    if data.with_ball:
+        observe_ball(i, columns, place, walker.physics, measurement, data.ball, observation)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
         bearing, distance = polar(i, x, y, measurement)
         observation[i, columns.goal], observation[i, columns.goal + 1] = bearing, distance
     if columns.low_level >= 0:
-        observe_low(i, rules)
-        for k in range(common.full.shape[1]):
-            observation[i, columns.low_level + k] = common.full[i, k]
+        observe_for_controller(i, data)
+        for k in range(data.controller.observation.shape[1]):
+            observation[i, columns.low_level + k] = data.controller.observation[i, k]
 
 
 # Loops over simulations; they take packs.
 
 
 @compiled_loop
-def take_all(env_ids: np.ndarray, action: np.ndarray, rules: PlanningRules) -> None:
-    """Stores clipped actions."""
-    for i in env_ids:
-        for k in range(action.shape[1]):
-            rules.state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
-
-
-@compiled_loop
-def begin_steps(env_ids: np.ndarray, rules: PlanningRules) -> None:
+def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Begins steps."""
     for i in env_ids:
-        begin_step(i, rules)
+        begin_step(i, action, data)
 
 
 @compiled_loop
-def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
+def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
-        measure(i, rules.common)
-        lay_plan(i, rules)
-        observe(i, rules)
+        measure_travel(i, data.walker, data.travel)
+        lay_plan(i, action, data)
+        observe_for_controller(i, data)
+        observe(i, data)
 
 
 @compiled_loop
-def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
+def finish_control_steps(env_ids: np.ndarray, data: PlanningData) -> int:
     """Finishes a control step; returns how many steps continue."""
     going = 0
     for i in env_ids:
-        going += finish_control_step(i, rules)
+        going += finish_control_step(i, data)
     return going
 
 
 @compiled_loop
-def score_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+def score_all(env_ids: np.ndarray, data: PlanningData) -> int:
     """Writes reward terms; returns in how many simulations goal or ball must be redrawn."""
     wanted = 0
     for i in env_ids:
-        wanted += score(i, rules)
+        wanted += score(i, data)
     return wanted
 
 
 @compiled_loop
-def finish_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish(i, rules)
+        finish(i, data)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+def observe_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Observes."""
     for i in env_ids:
-        measure(i, rules.common)
-        observe(i, rules)
+        measure_travel(i, data.walker, data.travel)
+        observe(i, data)

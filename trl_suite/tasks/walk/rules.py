@@ -9,7 +9,7 @@ import numpy as np
 
 from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.engine import native
-from trl_suite.kinematics import planar, spatial
+from trl_suite.kinematics import planar
 from trl_suite.kinematics.blocks import Block, Noise
 from trl_suite.kinematics.planar import (
     PlanarBody,
@@ -18,12 +18,12 @@ from trl_suite.kinematics.planar import (
     has_fallen,
     leaves,
 )
-from trl_suite.kinematics.spatial import (
-    SpatialBody,
-    SpatialMeasurement,
-    SpatialState,
+from trl_suite.tasks.components.spatial_rules import (
+    WalkerData,
+    breaks_down,
+    measure,
+    observe_body,
 )
-from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -31,8 +31,6 @@ from trl_suite.tasks.task import (
     too_fast,
 )
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
 SAMPLES = 50  # terrain heights that a planar character observes
@@ -68,26 +66,12 @@ class PlanarRules(NamedTuple):
     outcome: Outcome
 
 
-class SpatialRules(NamedTuple):
-    """Data for the compiled functions of a spatial walk.
+class SpatialData(NamedTuple):
+    """Data for the compiled functions of a spatial walk; `columns`: of the observation blocks."""
 
-    Attributes:
-      ctrl: controls of the physics, (n, ...).
-      columns: first columns of the observation blocks; -1: not observed.
-      leaving: whether the walker has left its ground window, which must then be moved, (n,).
-    """
-
-    engine: native.Engine
-    body: SpatialBody
-    physics: SpatialState
-    ground: SpatialWindows
-    drive: Drive
-    ctrl: np.ndarray
+    walker: WalkerData
     columns: Any
-    measurement: SpatialMeasurement
     state: WalkState
-    leaving: np.ndarray
-    outcome: Outcome
 
 
 # In the plane.
@@ -135,14 +119,12 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> Non
 
 
 @compiled
-def look_spatial(i: int, rules: SpatialRules) -> None:
+def look_spatial(i: int, data: SpatialData) -> None:
     """Measures and observes."""
-    measurement, state, observation = rules.measurement, rules.state, rules.outcome.observation
-    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
-    spatial.measure(i, rules.body, rules.physics, rules.ground, measurement)
-    columns = rules.columns
-    write_terrain(i, columns.terrain, rules.ground, measurement, observation)
-    write_body(i, columns.pose, columns.velocity, measurement, observation)
+    walker, state, columns = data.walker, data.state, data.columns
+    observation, measurement = walker.outcome.observation, walker.measurement
+    measure(i, walker)
+    observe_body(i, columns, walker, observation)
     bearing = state.target_heading[i] - measurement.heading[i]
     observation[i, columns.target_heading] = math.cos(bearing)
     observation[i, columns.target_heading + 1] = math.sin(bearing)
@@ -159,36 +141,13 @@ TARGET_HEADING = Block(
 
 
 @compiled_loop
-def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
-    """Applies actions and drives moving boxes; returns how many ground windows must be moved."""
-    leaving, root = 0, rules.body.links[0]
-    for i in env_ids:
-        drive(i, action, rules.drive, rules.ctrl)
-        x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
-        rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
-        if rules.leaving[i]:
-            leaving += 1
-        elif spatial_ground.keep_moving(
-            i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
-        ):
-            native.forward(i, rules.engine)
-    return leaving
-
-
-@compiled_loop
-def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> None:
+def finish_spatial(env_ids: np.ndarray, stepped: bool, data: SpatialData) -> None:
     """Finishes steps, or only observes."""
     for i in env_ids:
-        outcome = rules.outcome
+        walker = data.walker
+        if stepped and breaks_down(i, walker):  # keeps the last finite observation
+            conclude(i, True, walker.outcome)
+            continue
+        look_spatial(i, data)
         if stepped:
-            outcome.diverged[i] = (
-                native.diverged(i, rules.engine)
-                or too_fast(i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel)
-                or spatial.is_lost(i, rules.body, rules.physics, rules.ground)
-            )
-            if outcome.diverged[i]:  # keeps the last finite observation
-                conclude(i, True, outcome)
-                continue
-        look_spatial(i, rules)
-        if stepped:
-            conclude(i, rules.measurement.fallen[i], outcome)
+            conclude(i, walker.measurement.fallen[i], walker.outcome)

@@ -19,7 +19,7 @@ from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP
+from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, WalkerData, control_all
 from trl_suite.tasks.imitation.planar_rules import (
     CONTROL_TIMESTEP,
     SUBSTEPS,
@@ -40,10 +40,9 @@ from trl_suite.tasks.walk.rules import (
     GRAVITY,
     TARGET_HEADING,
     PlanarRules,
-    SpatialRules,
+    SpatialData,
     WalkState,
     act_planar,
-    act_spatial,
     finish_planar,
     finish_spatial,
 )
@@ -174,21 +173,19 @@ class Walk(Task):
         common: Any = {
             'engine': world.engine, 'body': figure.body, 'physics': figure.state,
             'ground': figure.ground, 'drive': self.action_map.drive(first), 'ctrl': world.ctrl,
-            'state': self.state, 'outcome': self.outcome,
+            'outcome': self.outcome,
         }  # fmt: skip
-        rules: SpatialRules | PlanarRules
+        rules: SpatialData | PlanarRules
         if self._spatial:
-            rules = SpatialRules(
-                **common, columns=columns(self.observed, self.blocks),
-                measurement=figure.measurement, leaving=np.zeros(n, bool),
-            )  # fmt: skip
-            self._leaving = rules.leaving
-            self._act, self._finish = act_spatial, finish_spatial
+            walker = WalkerData(**common, measurement=figure.measurement, leaving=np.zeros(n, bool))
+            rules = SpatialData(walker, columns(self.observed), self.state)
+            self._leaving = walker.leaving
+            self._act, self._act_pack, self._finish = control_all, packed(walker), finish_spatial
         else:
             measurement = figure.empty_measurement()
-            rules = PlanarRules(**common, measurement=measurement)
+            rules = PlanarRules(**common, measurement=measurement, state=self.state)
             self._leaving = measurement.leaving
-            self._act, self._finish = act_planar, finish_planar
+            self._act, self._act_pack, self._finish = act_planar, packed(rules), finish_planar
         self._pack = packed(rules)
 
     @property
@@ -237,7 +234,7 @@ class Walk(Task):
         self.observe(env_ids)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if self._act(env_ids, action, self._pack):
+        if self._act(env_ids, action, self._act_pack):
             # Before the physics steps, so that images rendered afterwards are up to date.
             leaving = env_ids[self._leaving[env_ids]]
             if isinstance(self.arena, SpatialArena):
