@@ -62,7 +62,6 @@ def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
     yield from common.character(environment, about.joints(task))
     yield from about.before(task)
     yield common.observation(environment)
-    yield from about.after(task)
     yield about.action(environment)
     yield common.ground(spec)
     yield from about.rules(spec, task)

@@ -74,8 +74,10 @@ def observation(environment: Environment) -> Section:
     """Returns the blocks of the observation."""
     task: Any = environment.task
     spatial = task.character.spec.spatial
-    axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
-    size = sum(block.size for block in task.observed)
+    axes = '; x is mirrored while the trunk points backwards'
+    if spatial:
+        axes = "; axes: x along the root's heading, y to the left, z up"
+    size, mirrored = sum(block.size for block in task.observed), getattr(task, 'mirrored', False)
     return section(
         f'Observation: {size} numbers, in this order{axes}',
         Table(
@@ -87,6 +89,7 @@ def observation(environment: Environment) -> Section:
                 for part in (task.blocks[block.name],)
             ],
         ),
+        *(['mirrored: in left stance, observations and actions are reflected'] if mirrored else []),
     )
 
 

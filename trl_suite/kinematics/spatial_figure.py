@@ -184,14 +184,14 @@ def body_blocks(character: Character, terrain_observation: bool) -> tuple[Block,
         ),
         Block(
             'pose', LINK_POSE * len(names) + 1, 'm, 1',
-            'root height above the ground; then for each link the position of its centre from the root and '
-            'its orientation (wxyz)', PLACES,
+            'root height above the ground; then for each link, in the order of Links, the position of its '
+            'centre from the root (3) and its orientation (wxyz)', PLACES,
             Reflection(np.append(0, 1 + index), np.append(1.0, sign)),
         ),
         Block(
             'velocity', LINK_VELOCITY * len(names), 'm/s, rad/s',
-            'for each link the velocity of its centre relative to the ground under the root, and its '
-            'angular velocity', SPEEDS, Reflection(*mirrored_blocks(links, (*VECTOR, *SPIN))),
+            'for each link the velocity of its centre relative to the ground under the root (3), and its '
+            'angular velocity (3)', SPEEDS, Reflection(*mirrored_blocks(links, (*VECTOR, *SPIN))),
         ),
     )  # fmt: skip
 

@@ -114,6 +114,8 @@ def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
 class Task(composer.Task):
     """Observation, reward, termination and reset of an environment, for n simulations at once.
 
+    `trl-suite info` prints the observation blocks and the reward terms of an environment's task.
+
     The rules of the suite's tasks are compiled functions of one simulation `i` (see
     `trl_suite.util.compiled`); the task holds the arrays that they use and calls loops over
     simulations. A custom task may do the same with plain NumPy.

@@ -48,7 +48,7 @@ class Description:
 
     Attributes:
       rules: spec, task -> sections on motion, reward and termination.
-      before, after: task -> sections before and after the section on the observation.
+      before: task -> sections before the section on the observation.
       action: environment -> section on the meaning of actions.
       time: spec, task -> section on rates and limits.
       joints: task -> title of the last column in the table of links, and its entry for each joint.
@@ -57,7 +57,6 @@ class Description:
 
     rules: Callable[[EnvSpec, Any], Iterator[Section]] = lambda spec, task: iter(())
     before: Callable[[Any], Iterator[Section]] = lambda task: iter(())
-    after: Callable[[Any], Iterator[Section]] = lambda task: iter(())
     action: Callable[[Environment], Section] = description.action
     time: Callable[[EnvSpec, Any], Section] = description.time
     joints: Callable[[Any], tuple[str, Iterable[object]]] = description.reward_weights

@@ -15,20 +15,6 @@ if TYPE_CHECKING:
 
 REWARD_WEIGHT = 'reward weight'  # title of a column of links
 
-# Size, unit and meaning of the parts of a plan.
-_PLAN = (
-    (3, 'm', 'first landing place relative to the right foot; 0 in right stance'),
-    (3, 'm', 'first landing place relative to the left foot; 0 in left stance'),
-    (3, 'm', 'second landing place relative to the right foot; 0 in left stance'),
-    (3, 'm', 'second landing place relative to the left foot; 0 in right stance'),
-    (1, 'rad', 'planned heading relative to the current one, positive to the left'),
-)
-_MIRRORED_PLAN = (
-    (1, 'rad', 'planned heading relative to the current one, positive to the swing side'),
-    (3, 'm', 'first landing place relative to the swing foot'),
-    (3, 'm', 'second landing place relative to the stance foot'),
-)
-
 
 def reward_weights(task: Any) -> tuple[str, Iterable[object]]:
     """Returns the title of a column in the table of links, and the reward weight of each joint."""
@@ -106,23 +92,6 @@ def time(spec: EnvSpec, task: Any) -> Section:
 def floats(values: Any) -> list[float]:
     """Returns values as Python floats."""
     return [float(value) for value in values]
-
-
-def plan(task: Any, mirrored: bool = False) -> Section:
-    """Returns the table of the parts of the footstep plan in the observation."""
-    parts = _MIRRORED_PLAN if mirrored else _PLAN
-    starts = task.blocks['plan'].start + np.cumsum([0, *(size for size, _, _ in parts)])
-    return section(
-        'Plan in the observation (x, y, and z above the ground at the root)',
-        Table(
-            ('from', 'to', 'size', 'unit', 'meaning'),
-            [
-                (int(start), int(start) + size, size, unit, text)
-                for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
-            ],
-        ),
-        *([] if task.character.spec.spatial else ['y and the heading are always 0 in the plane']),
-    )
 
 
 def span(values: tuple[float, float]) -> str:

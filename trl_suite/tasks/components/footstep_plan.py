@@ -29,12 +29,20 @@ CONTACT = Block(
 # Of a reflected plan, the landing places of the two feet are exchanged. Mirrored observations keep the
 # heading, the first landing place from the left foot, and the second from the right foot.
 PLAN = Block(
-    'plan', PLAN_SIZE, 'm, rad', 'footstep plan, see below', Noise((0.003, 0.01, 0.02)),
+    'plan', PLAN_SIZE, 'm, rad',
+    'x, y, and z above the ground under the root: of the first landing place from the right foot (0 in '
+    'right stance) and from the left foot (0 in left stance), of the second from the right foot (0 in left '
+    'stance) and from the left foot (0 in right stance); then the planned heading relative to the current '
+    'one, positive to the left',
+    Noise((0.003, 0.01, 0.02)),
     Reflection(
         np.append(np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel(), 12),
         np.append(np.tile(VECTOR, 4), -1.0),
     ),
     kept=(12, 3, 4, 5, 6, 7, 8),
+    kept_meaning='planned heading relative to the current one, positive to the swing side; then x, y, and z '
+    'above the ground under the root: of the first landing place from the swing foot, of the second from '
+    'the stance foot',
 )  # fmt: skip
 SOLE, SOLE_AHEAD = (
     (0.0885, 0.045, 0.004),

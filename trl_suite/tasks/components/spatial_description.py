@@ -2,43 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from trl_suite import terrain
 from trl_suite.tasks.components import ball, goals
-from trl_suite.tasks.components.description import plan, span
+from trl_suite.tasks.components.description import span
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
-from trl_suite.util.tables import Section, Table, section
+from trl_suite.util.tables import Section, section
 
 if TYPE_CHECKING:
     from trl_suite.registry.spec import EnvSpec
-
-
-def after(task: Any) -> Iterator[Section]:
-    """Yields the tables of links and of the plan in the observation."""
-    links = list(task.character.spec.links)
-    pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
-    if task.mirrored:
-        # The table below is for right stance; in left stance links are exchanged.
-        yield section(
-            'Mirrored: in left stance, observations and actions are mirrored',
-            'the sides in the table below are then exchanged',
-        )
-    yield section(
-        'Links in the observation (centre 3 and orientation 4; velocity 3 and angular velocity 3)',
-        Table(
-            ('link', 'pose from', 'to', 'velocity from', 'to'),
-            [
-                (name, *(pose + 7 * i + k for k in (0, 7)), *(velocity + 6 * i + k for k in (0, 6)))
-                for i, name in enumerate(links)
-            ],
-        ),
-    )
-    if 'plan' in task.blocks:
-        yield plan(task, task.mirrored)
 
 
 def start(spec: EnvSpec) -> Section:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite.tasks.components import description, spatial_description
+from trl_suite.tasks.components import description
 from trl_suite.tasks.components.description import span
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, section
@@ -16,11 +16,6 @@ _SWING = (
     'landing place'
 )
 LEGEND = ' Orange and blue: planned landing places of the swing foot and of the stance foot.'
-
-
-def after(task: Any) -> Iterator[Section]:
-    """Yields the table of the parts of the plan in the observation."""
-    yield description.plan(task)
 
 
 def planar_rules(spec: Any, task: Any) -> Iterator[Section]:
@@ -74,5 +69,5 @@ def _plans(task: Any) -> list[str]:
     return lines
 
 
-PLANAR = Description(rules=planar_rules, after=after, legend=LEGEND)
-SPATIAL = Description(rules=spatial_rules, after=spatial_description.after, legend=LEGEND)
+PLANAR = Description(rules=planar_rules, legend=LEGEND)
+SPATIAL = Description(rules=spatial_rules, legend=LEGEND)

@@ -267,15 +267,6 @@ class PlanarFootstepsConfig(PlanarConfig):
 class PlanarFootsteps(PlanarImitation):
     """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip.
 
-    Observation blocks, in this order (N links; heading frame as for `PlanarImitation`), N = 12: 69 numbers:
-      terrain, pose, velocity, phase: as for `PlanarImitation`; right stance while the phase is
-        below 0.5.
-      contact: whether right and left foot touch the ground; 2.
-      plan: as in three dimensions, with y = 0 in each position (x, y, z): first landing place
-        relative to the right foot, 0 in right stance, and to the left foot, 0 in left stance;
-        second landing place relative to the right foot, 0 in left stance, and to the left foot, 0
-        in right stance; z is relative to the ground under the root; then 0 for the heading; 13.
-
     Attributes:
       plan: the footsteps; see `Plan`.
     """

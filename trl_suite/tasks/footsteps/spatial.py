@@ -91,21 +91,8 @@ class SpatialFootstepsConfig(MirroredConfig):
 class SpatialFootsteps(TrackingTask):
     """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
 
-    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
-    left, z up), N = 8: 125 numbers:
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, with the option terrain_observation.
-      pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
-      phase: phase in [0, 1), then the one-hot of its quarter; 5. Right stance below 0.5.
-      contact: whether right and left foot touch the ground; 2.
-      plan: first landing place relative to the right foot, 0 in right stance, and to the left foot,
-        0 in left stance; second landing place relative to the right foot, 0 in left stance, and to
-        the left foot, 0 in right stance; (x, y, z) each, z relative to the ground under the root;
-        then the planned heading, rad to the left of the current one; 13.
-
-    With the option `mirrored`, an observation has 117 numbers. Observations and actions are reflected
-    in left stance. The phase is that of the single step, with the one-hot of its half (3). The plan
-    (7) has the heading first, then the first landing place relative to the swing foot, then the
-    second relative to the stance foot.
+    With the option `mirrored`, observations and actions are reflected in left stance; the phase is
+    then that of the single step, and the plan has only the landing places that are not 0.
     """
 
     terms = TERMS

@@ -332,8 +332,8 @@ def observed_blocks(
     """Returns the blocks that `observe` writes, from those that `measure` writes."""
     terrain, pose, velocity = measured
     stance = '; the stance leg first, then the swing leg' if spec.mirror else ''
-    pitch = stance or '; the last number is the pitch of the root (rad)'
-    rate = stance or '; the last number is the pitch rate of the root (rad/s)'
+    pitch = stance or '; the last z is replaced by the pitch of the root (rad)'
+    rate = stance or '; the last z is replaced by the pitch rate of the root (rad/s)'
     return (
         terrain,
         dataclasses.replace(

@@ -97,12 +97,6 @@ class GaitConfig(Config):
 class GaitTask(Task):
     """A planar character travels at a target speed; actions set the parameters of its gait.
 
-    Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
-    relative to the ground under it, m; 'pose', height of the root above the ground and (x, z) of
-    every other link relative to the root, m; 'velocity', (x, z) of every link, m/s. For bipeds the
-    stance leg comes first, then the swing leg. For the hopper, z of the last link is replaced by
-    the root's pitch in 'pose' and by its rate in 'velocity'.
-
     Attributes:
       gait: the state machines.
       state: state of the task, after `bind`.

@@ -3,7 +3,7 @@
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import differences
 from trl_suite.tasks.components.differences import Difference
-from trl_suite.tasks.imitation import description
+from trl_suite.tasks.imitation.description import IMITATION
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.tasks.imitation.spatial import SpatialImitation, SpatialImitationConfig
 from trl_suite.tasks.task_type import TaskType, tracking
@@ -15,7 +15,7 @@ TYPES = (
         spatial=False,
         config=PlanarImitationConfig,
         make=tracking(PlanarImitation),
-        description=description.PLANAR,
+        description=IMITATION,
         motion=Clip,
         differences=(
             Difference(
@@ -35,7 +35,7 @@ TYPES = (
         spatial=True,
         config=SpatialImitationConfig,
         make=tracking(SpatialImitation),
-        description=description.SPATIAL,
+        description=IMITATION,
         motion=Clip,
         differences=(
             differences.FROM_3000, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite.tasks.components import description, spatial_description
+from trl_suite.tasks.components import description
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section
 
@@ -17,5 +17,4 @@ def rules(spec: Any, task: Any) -> Iterator[Section]:
     yield description.fall(task)
 
 
-PLANAR = Description(rules=rules)
-SPATIAL = Description(rules=rules, after=spatial_description.after)
+IMITATION = Description(rules=rules)

@@ -116,15 +116,7 @@ class PlanarImitationConfig(PlanarConfig):
 class PlanarImitation(Task):
     """A planar character tracks a looping clip over random terrain.
 
-    Observation blocks, in this order (N links; heading frame: x is mirrored while the trunk points
-    backwards, heights are relative to the ground under the root):
-      terrain: heights of the ground at the sample points, m.
-      pose: height of the root, then (x, z) of every link centre relative to the root, m; 2N + 1.
-      velocity: (x, z) velocity of every link centre, m/s; 2N.
-      strain: fibre strain of every muscle, with muscle control.
-      phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
-      reference: height of the reference's root, then its link positions relative to its root and its
-        link velocities; 4N + 1.
+    Positions are observed from the root; x is mirrored while the trunk points backwards.
     """
 
     terms = rewards.IMITATION_TERMS

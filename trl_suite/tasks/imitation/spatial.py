@@ -169,19 +169,9 @@ class SpatialImitationConfig(MirroredConfig):
 class SpatialImitation(TrackingTask):
     """A spatial character tracks a looping clip along +x, over random terrain.
 
-    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
-    left, z up; heights are relative to the ground under the root):
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, with the option terrain_observation.
-      pose: height of the root, then for every link the position of its centre relative to the root
-        (3), m, and its orientation (4) as a quaternion wxyz with w not negative; 7N + 1.
-      velocity: for every link the velocity of its centre (3), m/s, relative to the ground under
-        the root, and its angular velocity (3), rad/s; 6N.
-      phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
-      reference: height of the reference's root, then its link positions relative to its root, then
-        its link velocities, in the reference's heading frame; 6N + 1.
-      goal: bearing (rad, positive to the left) and distance (m) of the point on the line through
-        the start along +x that is 3 m ahead of the root. The original observes bearing and distance
-        of the start instead, from which the direction +x cannot be derived.
+    The goal is a point on the line through the start along +x. The original observes bearing and
+    distance of the start instead, from which the direction +x cannot be derived.
+
     Mirrored observations and actions are reflected while the phase is 0.5 or more; the block phase
     then has the phase of the single step and the one-hot of its half.
     """

@@ -121,10 +121,10 @@ def _full_with_ball(task: Any) -> str:
 
 
 DIRECT = Description(
-    rules=about_joints, after=spatial_description.after, legend=_BEADS,
+    rules=about_joints, legend=_BEADS,
 )  # fmt: skip
 HIERARCHICAL = Description(
-    rules=about_plans, after=spatial_description.after, action=action,
+    rules=about_plans, action=action,
     time=time, joints=lambda task: ('', [''] * len(task.character.spec.joints)),
     legend=LEGEND + _BEADS,
 )  # fmt: skip

@@ -87,11 +87,6 @@ class DirectNavigation(TrackingTask):
     additional terms for heading towards the goal and for proximity (`direct_terms`). With a
     ball, half of the reward has these terms, with the ball as the goal, and half is for dribbling
     (`ball.soccer_terms`).
-
-    Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
-      goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball,
-        measured from the ball.
-      ball: with a ball, see `trl_suite.tasks.components.ball.BALL`; 9.
     """
 
     CONFIG: Any = DirectConfig

@@ -155,16 +155,6 @@ class HierarchicalNavigation(SpatialTask):
     of the stance foot, and a heading, relative to position and heading of the root at the beginning
     of the step.
 
-    Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if heights are observed.
-      surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if velocities are observed.
-      pose, velocity: as in `SpatialImitation`.
-      goal: bearing of the goal, rad to the left, and its distance, m; with a ball, measured from
-        the ball.
-      ball: with a ball, see `trl_suite.tasks.components.ball.BALL`; 9.
-      low_level: observation of the footstep controller, with interface 'frame' only; see
-        `SpatialFootsteps`.
-
     Attributes:
       watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """

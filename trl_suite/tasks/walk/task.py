@@ -95,11 +95,6 @@ class Walk(Task):
     `WALK`, unless the option `rewards` is given; a subclass may compute one after
     `super().finish_step`.
 
-    Observation blocks, in this order: terrain (optional), pose and velocity, as in
-    `PlanarImitation` and `SpatialImitation`, and for a spatial character:
-      target_heading: cosine and sine of the bearing of the target heading, the heading at the
-        start; 2.
-
     Attributes:
       full_speed: speed at which the reward term `speed_ratio` reaches its maximum, m/s.
     """
