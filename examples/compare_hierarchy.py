@@ -27,7 +27,7 @@ import ppo_settings
 import torch
 
 from trl_suite import policies, suite
-from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
+from trl_suite.tasks.task import CONTROL_TIMESTEP
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
 

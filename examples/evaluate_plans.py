@@ -26,8 +26,8 @@ from joint_expert import joint_expert
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
-from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.navigation.scripted import scripted
+from trl_suite.tasks.task import CONTROL_TIMESTEP
 from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment

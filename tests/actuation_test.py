@@ -8,7 +8,7 @@ from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
 from trl_suite import actuation, characters, motion, suite
-from trl_suite.tasks.imitation import planar_rules as imitation_rules
+from trl_suite.tasks import task
 from trl_suite.util import resources
 
 TIMESTEP = 1 / 300  # s
@@ -195,7 +195,7 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(figures['spine0'], (0, 6.28), atol=1e-9)
 
     def test_action_offset_and_scale(self):
-        self.assertCountEqual(imitation_rules.ACTION_OFFSETS, ('clip', 'posture', 'original'))
+        self.assertCountEqual(task.ACTION_OFFSETS, ('clip', 'posture', 'original'))
         mapping = suite.build('raptor', task_kwargs={'action_offset': 'posture'}).action_map
         self.assertAlmostEqual(mapping.action_offset[mapping.names.index('left_hip')], 0.46487)
         mapping = suite.build('raptor', task_kwargs={'action_scale': 0.7}).action_map

@@ -228,6 +228,15 @@ def diverged(i: int, engine: Engine) -> bool:
     return False
 
 
+@compiled
+def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
+    """Returns whether the magnitude of any of these velocities is above a limit, or NaN."""
+    for k in dofs:
+        if not abs(qvel[i, k]) <= limit:
+            return True
+    return False
+
+
 # Loops over simulations; they take packs.
 
 

@@ -7,14 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.actuation.action_map import Drive, drive
+from trl_suite.engine import native
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, compiled_loop
 
+MAX_JOINT_SPEED = 200.0  # rad/s; above it a simulation counts as diverged
 _UPRIGHT = np.pi / 2  # rad; below this pitch a trunk points forwards
 
 
-class PlanarBody(NamedTuple):
+class PlanarIds(NamedTuple):
     """A character's ids in a compiled model; links and joints in link order.
 
     Attributes:
@@ -65,8 +68,6 @@ class PlanarMeasurement(NamedTuple):
       effectors: end effectors: all x relative to the centre of mass, or to the root, then all z
         above the ground, (n, 2 * E) m.
       com_velocity: velocity of the centre of mass, (n, 2) m/s.
-      leaving: whether the character has left its ground window, which must then be moved, (n,).
-      waiting: whether ground outside the window must be drawn before the measurement, (n,).
     """
 
     facing: np.ndarray
@@ -74,20 +75,36 @@ class PlanarMeasurement(NamedTuple):
     height: np.ndarray
     effectors: np.ndarray
     com_velocity: np.ndarray
+
+
+class PlanarBodyData(NamedTuple):
+    """A character in all simulations, for compiled functions.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      leaving: whether the character has left its ground window, which must then be moved, (n,).
+    """
+
+    engine: native.Engine
+    ids: PlanarIds
+    physics: PlanarState
+    ground: PlanarWindows
+    drive: Drive
+    ctrl: np.ndarray
+    measurement: PlanarMeasurement
     leaving: np.ndarray
-    waiting: np.ndarray
 
 
-def empty_measurement(n: int, body: PlanarBody) -> PlanarMeasurement:
+def empty_measurement(n: int, body: PlanarIds) -> PlanarMeasurement:
     """Allocates the results of `measure` for n characters."""
     return PlanarMeasurement(
         np.ones(n), np.zeros(n), np.zeros(n), np.zeros((n, 2 * len(body.effectors))),
-        np.zeros((n, 2)), np.zeros(n, bool), np.zeros(n, bool),
+        np.zeros((n, 2)),
     )  # fmt: skip
 
 
 @compiled
-def facing_of(i: int, body: PlanarBody, state: PlanarState) -> float:
+def facing_of(i: int, body: PlanarIds, state: PlanarState) -> float:
     """Returns 1, or -1 if the trunk points backwards: the terrain is then observed backwards."""
     pitch = state.qpos[i, body.qpos[2]]
     return -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
@@ -95,7 +112,7 @@ def facing_of(i: int, body: PlanarBody, state: PlanarState) -> float:
 
 @compiled
 def looks_outside(
-    i: int, facing: float, body: PlanarBody, state: PlanarState, ground: PlanarWindows
+    i: int, facing: float, body: PlanarIds, state: PlanarState, ground: PlanarWindows
 ) -> bool:
     """Returns whether ground samples or end effectors of a character are outside its window."""
     x = state.qpos[i, body.qpos[0]]
@@ -109,7 +126,7 @@ def looks_outside(
 
 
 @compiled
-def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows) -> bool:
+def must_wait(i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows) -> bool:
     """Returns whether `PlanarArena.widen` must be called before a character can be measured.
 
     The terrain is drawn on demand; a character that points backwards may need ground outside its
@@ -123,7 +140,7 @@ def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindow
 
 @compiled
 def measure(
-    i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
+    i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
     measurement: PlanarMeasurement,
 ) -> None:  # fmt: skip
     """Writes the blocks terrain, pose and velocity, and the other measurements.
@@ -176,7 +193,7 @@ def measure(
 
 
 @compiled
-def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
+def has_fallen(i: int, body: PlanarIds, state: PlanarState) -> bool:
     """Returns whether a fall link touches the ground."""
     for sensor in body.fall:
         if state.sensordata[i, sensor] != 0.0:
@@ -185,19 +202,39 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 
 
 @compiled
-def is_lost(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows) -> bool:
+def is_lost(i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows) -> bool:
     """Returns whether a character is where no ground is drawn; its episode then ends as diverged."""
     return planar_ground.is_lost(i, state.qpos[i, body.qpos[0]], ground)
 
 
 @compiled
-def leaves(
-    i: int,
-    body: PlanarBody,
-    state: PlanarState,
-    ground: PlanarWindows,
-    measurement: PlanarMeasurement,
-) -> bool:
-    """Writes and returns whether a character has left its ground window, which must be moved."""
-    measurement.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
-    return measurement.leaving[i]
+def leaves(i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows) -> bool:
+    """Returns whether a character has left its ground window, which must be moved."""
+    return planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
+
+
+@compiled
+def look(i: int, body: PlanarBodyData, observation: np.ndarray) -> None:
+    """Measures a character, and writes the blocks terrain, pose and velocity."""
+    measure(i, body.ids, body.physics, body.ground, observation, body.measurement)
+
+
+@compiled
+def breaks_down(i: int, body: PlanarBodyData) -> bool:
+    """Returns whether a simulation diverged or a character left its ground."""
+    return (
+        native.diverged(i, body.engine)
+        or native.too_fast(i, body.ids.dof[2:], MAX_JOINT_SPEED, body.physics.qvel)
+        or is_lost(i, body.ids, body.physics, body.ground)
+    )
+
+
+@compiled_loop
+def control_all(env_ids: np.ndarray, action: np.ndarray, body: PlanarBodyData) -> int:
+    """Writes controls; returns how many ground windows must be moved. Takes a pack."""
+    leaving = 0
+    for i in env_ids:
+        drive(i, action, body.drive, body.ctrl)
+        body.leaving[i] = leaves(i, body.ids, body.physics, body.ground)
+        leaving += body.leaving[i]
+    return leaving

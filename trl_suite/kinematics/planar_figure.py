@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import HEIGHTS, PLACES, SPEEDS, Block
 from trl_suite.kinematics.planar import (
-    PlanarBody,
-    PlanarMeasurement,
+    PlanarBodyData,
+    PlanarIds,
     PlanarState,
+    control_all,
     empty_measurement,
 )
 from trl_suite.terrain.planar import windows as planar_ground
@@ -25,16 +27,19 @@ class PlanarFigure:
     """One planar character in every simulation of a world.
 
     Attributes:
-      body: its ids, after `bind`; see `PlanarBody`.
+      body: its ids, after `bind`; see `PlanarIds`.
       state: the fields of the physics from which it is measured.
+      measurement: the last measurement.
+      data: all of these for compiled functions, if `bind` was given an action map.
       pose_qpos, pose_dof: addresses of x, z, pitch and the joints in link order.
       links, effectors: body ids, in link order.
       geoms: ids of the collision geoms.
       blocks: the observation blocks of the body.
     """
 
-    body: PlanarBody
+    body: PlanarIds
     state: PlanarState
+    data: PlanarBodyData
 
     def __init__(
         self,
@@ -85,13 +90,20 @@ class PlanarFigure:
         )  # fmt: skip
         return name
 
-    def bind(self, world: World, blocks: dict[str, slice], about: str = 'com') -> None:
+    def bind(
+        self,
+        world: World,
+        blocks: dict[str, slice],
+        about: str = 'com',
+        action_map: ActionMap | None = None,
+    ) -> None:
         """Resolves ids in a compiled world.
 
         Args:
           world: the simulations.
           blocks: slices of terrain, pose and velocity in the array that `measure` writes.
           about: origin of end effector positions, the centre of mass ('com') or the 'root'.
+          action_map: the map from actions to the actuators of the joints, for `control`.
         """
         self._world = world
         self.arena.bind(world)
@@ -107,7 +119,7 @@ class PlanarFigure:
         self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
         self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         mass = world.models[0].body_mass[self.links]
-        self.body = PlanarBody(
+        self.body = PlanarIds(
             self.pose_qpos, self.pose_dof, self.links, self.effectors, mass / mass.sum(),
             about == 'com', self._samples,
             world.sensor_addresses(self._fall_sensors).astype(int),
@@ -116,15 +128,36 @@ class PlanarFigure:
             blocks['velocity'].start,
         )  # fmt: skip
         self.state = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
+        self.measurement = empty_measurement(world.n, self.body)
+        if action_map is not None:
+            # The controls are consecutive.
+            first = int(world.control_addresses([scope + action_map.actuators[0]])[0])
+            self.data = PlanarBodyData(
+                engine=world.engine,
+                ids=self.body,
+                physics=self.state,
+                ground=self.ground,
+                drive=action_map.drive(first),
+                ctrl=world.ctrl,
+                measurement=self.measurement,
+                leaving=np.zeros(world.n, bool),
+            )
+            self._pack = packed(self.data)
 
     @property
     def ground(self) -> PlanarWindows:
         """The ground of all simulations, for compiled functions."""
         return self.arena.ground
 
-    def empty_measurement(self) -> PlanarMeasurement:
-        """Allocates the results of `measure` for all simulations."""
-        return empty_measurement(self._world.n, self.body)
+    def control(self, env_ids: np.ndarray, action: np.ndarray) -> None:
+        """Writes the controls of some simulations; moves ground windows, so that images show them.
+
+        Args:
+          env_ids: indices of simulations.
+          action: actions of all simulations, (n, k), in [-1, 1].
+        """
+        if control_all(env_ids, action, self._pack):
+            self.follow(env_ids[self.data.leaving[env_ids]])
 
     def follow(self, env_ids: np.ndarray) -> None:
         """Moves the ground windows of some simulations to the positions of their characters."""
@@ -163,7 +196,7 @@ class PlanarFigure:
 @compiled
 def put_down(
     env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray,
-    body: PlanarBody, ground: PlanarWindows, qpos: np.ndarray, qvel: np.ndarray,
+    body: PlanarIds, ground: PlanarWindows, qpos: np.ndarray, qvel: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes poses and velocities of characters placed at x = 0; see `PlanarFigure.place`."""
     for row in range(len(env_ids)):

@@ -12,6 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.actuation.action_map import Drive, drive
+from trl_suite.engine import native
+from trl_suite.kinematics.planar import MAX_JOINT_SPEED
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
@@ -19,7 +22,7 @@ from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
 LINK_POSE, LINK_VELOCITY = 7, 6  # numbers of each link in the blocks pose and velocity
 
 
-class SpatialBody(NamedTuple):
+class SpatialIds(NamedTuple):
     """A character's ids in a compiled model; links and joints in link order.
 
     Attributes:
@@ -96,7 +99,7 @@ class SpatialMeasurement(NamedTuple):
     features: np.ndarray
 
 
-def empty_measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
+def empty_measurement(n: int, body: SpatialIds) -> SpatialMeasurement:
     """Allocates the results of `measure` for n characters."""
     links, effectors = len(body.links), len(body.effectors)
     columns = feature_columns(body)
@@ -109,13 +112,13 @@ def empty_measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
     )  # fmt: skip
 
 
-def feature_columns(body: SpatialBody) -> dict[str, slice]:
+def feature_columns(body: SpatialIds) -> dict[str, slice]:
     """Returns name -> columns of the features of a character.
 
     `rotations`: quaternions of the root without its heading and of the ball joints; `angles`: of
     the hinges, rad; `rates`: of the root in the heading frame and of all joints, rad/s;
     `effectors`: end effector positions in the heading frame, x and y from the centre of mass or the
-    root (see `SpatialBody.about_com`), z above the ground, m; `com_velocity`: in world axes, m/s;
+    root (see `SpatialIds.about_com`), z above the ground, m; `com_velocity`: in world axes, m/s;
     `height`: of the root above the ground, m.
     """
     sizes = {
@@ -131,7 +134,7 @@ def feature_columns(body: SpatialBody) -> dict[str, slice]:
 
 
 @compiled
-def is_lost(i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows) -> bool:
+def is_lost(i: int, body: SpatialIds, state: SpatialState, ground: SpatialWindows) -> bool:
     """Returns whether a character is where there is no ground; its episode then ends as diverged."""
     root = state.xpos[i, body.links[0]]
     return spatial_ground.is_lost(i, root[0], root[1], root[2], ground)
@@ -139,7 +142,7 @@ def is_lost(i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindo
 
 @compiled
 def measure(
-    i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows,
+    i: int, body: SpatialIds, state: SpatialState, ground: SpatialWindows,
     measurement: SpatialMeasurement,
 ) -> None:  # fmt: skip
     """Measures the character of simulation i."""
@@ -275,10 +278,63 @@ def polar(i: int, x: float, y: float, measurement: SpatialMeasurement) -> tuple[
     return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
 
 
+class SpatialBodyData(NamedTuple):
+    """A character in all simulations, for compiled functions.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      leaving: whether the character has left its ground window, which must then be moved, (n,).
+    """
+
+    engine: native.Engine
+    ids: SpatialIds
+    physics: SpatialState
+    ground: SpatialWindows
+    drive: Drive
+    ctrl: np.ndarray
+    measurement: SpatialMeasurement
+    leaving: np.ndarray
+
+
+@compiled
+def look(i: int, body: SpatialBodyData) -> None:
+    """Measures a character, relative to the current ground."""
+    spatial_ground.see_movers(i, body.physics.qpos, body.ground)
+    measure(i, body.ids, body.physics, body.ground, body.measurement)
+
+
+@compiled
+def breaks_down(i: int, body: SpatialBodyData) -> bool:
+    """Returns whether a simulation diverged or a character left its ground."""
+    return (
+        native.diverged(i, body.engine)
+        or native.too_fast(i, body.ids.joint_dof, MAX_JOINT_SPEED, body.physics.qvel)
+        or is_lost(i, body.ids, body.physics, body.ground)
+    )
+
+
+@compiled_loop
+def control_all(env_ids: np.ndarray, action: np.ndarray, body: SpatialBodyData) -> int:
+    """Writes controls and drives moving boxes; returns how many ground windows must be moved.
+
+    To move a window drives its boxes as well. Takes a pack.
+    """
+    leaving, root = 0, body.ids.links[0]
+    for i in env_ids:
+        drive(i, action, body.drive, body.ctrl)
+        x, y = body.physics.xpos[i, root, 0], body.physics.xpos[i, root, 1]
+        body.leaving[i] = spatial_ground.has_left(i, x, y, body.ground)
+        if body.leaving[i]:
+            leaving += 1
+        elif spatial_ground.keep_moving(i, x, y, body.physics.qpos, body.physics.qvel, body.ground):
+            native.forward(i, body.engine)
+    return leaving
+
+
 class Measured(NamedTuple):
     """Data for loops over characters."""
 
-    body: SpatialBody
+    body: SpatialIds
     state: SpatialState
     ground: SpatialWindows
     measurement: SpatialMeasurement

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
@@ -26,9 +27,11 @@ from trl_suite.kinematics.spatial import (
     LINK_POSE,
     LINK_VELOCITY,
     Measured,
-    SpatialBody,
+    SpatialBodyData,
+    SpatialIds,
     SpatialMeasurement,
     SpatialState,
+    control_all,
     empty_measurement,
     measure_all,
 )
@@ -48,17 +51,19 @@ class SpatialFigure:
     """One character in every simulation of a world.
 
     Attributes:
-      body: its ids, after `bind`; see `SpatialBody`.
+      body: its ids, after `bind`; see `SpatialIds`.
       state: the fields of the physics from which it is measured.
       measurement: the last measurement.
+      data: all of these for compiled functions.
       pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
       links: body ids, in link order.
       blocks: the observation blocks of the body.
     """
 
-    body: SpatialBody
+    body: SpatialIds
     state: SpatialState
     measurement: SpatialMeasurement
+    data: SpatialBodyData
     fields: tuple[str, ...] = ('xquat',)  # further fields of MjData to bind, see `World`
 
     def __init__(
@@ -93,11 +98,12 @@ class SpatialFigure:
             )  # fmt: skip
         return names
 
-    def bind(self, world: World, about: str = 'com') -> None:
+    def bind(self, world: World, action_map: ActionMap, about: str = 'com') -> None:
         """Resolves ids in a compiled world.
 
         Args:
           world: the simulations.
+          action_map: the map from actions to the actuators of the joints.
           about: origin of end effector positions, the centre of mass ('com') or the 'root'.
         """
         self._world = world
@@ -115,7 +121,7 @@ class SpatialFigure:
             world.sensor_addresses([*itertools.chain(*names)]).astype(int)
             for names in self._sensors.values()
         )
-        self.body = SpatialBody(
+        self.body = SpatialIds(
             self.pose_qpos, self.pose_dof, self.pose_dof[6:].copy(),
             _addresses(qpos[1:][ball], sizes[ball]), qpos[1:][~ball], self.links,
             world.body_ids([b.full_identifier for b in character.end_effectors]),
@@ -125,6 +131,20 @@ class SpatialFigure:
         self.state = SpatialState(*(getattr(world, name) for name in SpatialState._fields))
         self.measurement = empty_measurement(world.n, self.body)
         self._pack = packed(Measured(self.body, self.state, self.ground, self.measurement))
+        # The controls are consecutive.
+        scope = f'{character.mjcf_model.model}/'
+        first = int(world.control_addresses([scope + action_map.actuators[0]])[0])
+        self.data = SpatialBodyData(
+            engine=world.engine,
+            ids=self.body,
+            physics=self.state,
+            ground=self.ground,
+            drive=action_map.drive(first),
+            ctrl=world.ctrl,
+            measurement=self.measurement,
+            leaving=np.zeros(world.n, bool),
+        )
+        self._data_pack = packed(self.data)
         geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
         boxes = model.geom_aabb[geoms, None]  # centres and half sizes, in the geoms' frames
@@ -144,6 +164,17 @@ class SpatialFigure:
     def effectors(self) -> np.ndarray:
         """Body ids of the end effectors, in link order."""
         return self.body.effectors
+
+    def control(self, env_ids: np.ndarray, action: np.ndarray) -> None:
+        """Writes the controls of some simulations; moves ground windows, so that images show them.
+
+        Args:
+          env_ids: indices of simulations.
+          action: actions of all simulations, (n, k), in [-1, 1].
+        """
+        if control_all(env_ids, action, self._data_pack):
+            leaving = env_ids[self.data.leaving[env_ids]]
+            self.arena.follow(self._world.xpos[leaving, self.links[0], :2], leaving)
 
     def measure(self, env_ids: np.ndarray | None = None) -> SpatialMeasurement:
         """Measures the characters of some simulations, or of all; returns `measurement`."""

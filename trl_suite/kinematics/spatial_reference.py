@@ -14,7 +14,7 @@ from trl_suite.kinematics.spatial import (
     LINK_POSE,
     LINK_VELOCITY,
     Measured,
-    SpatialBody,
+    SpatialIds,
     SpatialState,
     empty_measurement,
     feature_columns,
@@ -73,7 +73,7 @@ class SpatialReference:
     """
 
     def __init__(
-        self, body: SpatialBody, model: mujoco.MjModel, poses: np.ndarray, rates: np.ndarray
+        self, body: SpatialIds, model: mujoco.MjModel, poses: np.ndarray, rates: np.ndarray
     ) -> None:
         """Tabulates tracks.
 
@@ -115,13 +115,13 @@ class SpatialReference:
         }
 
     @classmethod
-    def of_clip(cls, clip: Clip, body: SpatialBody, model: mujoco.MjModel) -> SpatialReference:
+    def of_clip(cls, clip: Clip, body: SpatialIds, model: mujoco.MjModel) -> SpatialReference:
         """Returns a reference with the cycle of a looping clip as track 0."""
         times = np.linspace(0, clip.duration, CYCLE_SAMPLES + 1)
         return cls(body, model, clip.pose(times)[None], clip.velocity(times)[None])
 
     @classmethod
-    def of_steps(cls, steps: Steps, body: SpatialBody, model: mujoco.MjModel) -> SpatialReference:
+    def of_steps(cls, steps: Steps, body: SpatialIds, model: mujoco.MjModel) -> SpatialReference:
         """Returns a reference with a library's k steps in right stance, then their mirror images."""
         times = np.linspace(0, steps.duration, STEP_SAMPLES + 1)
         index = np.tile(np.arange(len(steps)), 2)[:, None]
@@ -139,7 +139,7 @@ class SpatialReference:
 
 
 def _stacked(
-    model: mujoco.MjModel, body: SpatialBody, poses: np.ndarray, rates: np.ndarray
+    model: mujoco.MjModel, body: SpatialIds, poses: np.ndarray, rates: np.ndarray
 ) -> SpatialState:
     """Returns fields of the physics for poses (n, ...) and rates (n, ...), without simulating."""
     names = [name for name in SpatialState._fields if name != 'sensordata']

@@ -21,21 +21,20 @@ from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.components.reflection import action_reflection
 from trl_suite.tasks.components.spatial_rules import (
     _DIGITS,
-    ACTION_OFFSETS,
     ACTION_SCALE,
-    CONTROL_TIMESTEP,
     HEIGHT_MAP,
     PHASE,
-    SUBSTEPS,
     Clock,
     Travel,
     View,
-    WalkerData,
-    act_all,
+    reflect_all,
 )
 from trl_suite.tasks.task import (
+    ACTION_OFFSETS,
+    CONTROL_TIMESTEP,
     MOST_SUBSTEPS,
     START_PHASE,
+    SUBSTEPS,
     TERRAIN_LEVEL,
     Task,
     check_position_options,
@@ -175,28 +174,12 @@ class SpatialTask(Task):
     def _bind_walker(self, world: World) -> None:
         """Binds the walker; a subclass may extend `saved` and `info_arrays` afterwards."""
         self.world, n = world, world.n
-        figure = self.figure
-        figure.bind(world, self.ABOUT)
+        self.figure.bind(world, self.joint_map, self.ABOUT)
         self.clock = Clock(np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n))
         self.travel = Travel(np.zeros((n, 3)), np.zeros(n))
         self._random = [np.random.default_rng(0)] * n  # for draws within an episode
         self._allocate(n, self.travel.distance)
         self.saved = (self.clock, self.travel, self.outcome)
-        scope = f'{self.character.mjcf_model.model}/'
-        # The controls are consecutive.
-        first = int(world.control_addresses([scope + self.joint_map.actuators[0]])[0])
-        self.walker = WalkerData(
-            engine=world.engine,
-            body=figure.body,
-            physics=figure.state,
-            ground=figure.ground,
-            drive=self.joint_map.drive(first),
-            ctrl=world.ctrl,
-            measurement=figure.measurement,
-            leaving=np.zeros(n, bool),
-            outcome=self.outcome,
-        )
-        self._walker_pack = packed(self.walker)
 
     @property
     def phase(self) -> np.ndarray:
@@ -226,11 +209,6 @@ class SpatialTask(Task):
         """Sets the clocks of some simulations to `clock.start`."""
         cycles = np.rint(self.clock.start[env_ids] * _DIGITS) / _DIGITS
         self.clock.cycles[env_ids], self.clock.phase[env_ids] = cycles, cycles - np.floor(cycles)
-
-    def _lay_ground(self, env_ids: np.ndarray) -> None:
-        """Moves the ground windows of those simulations that have left theirs."""
-        leaving = env_ids[self.walker.leaving[env_ids]]
-        self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
 
     def get_state(self, env_id: int) -> dict[str, Any]:
         return {
@@ -327,7 +305,7 @@ class TrackingTask(SpatialTask):
             full = np.zeros((world.n, sum(block.size for block in self.full)))
             self.saved = (*self.saved, Full(full))
         none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
-        view = View(
+        self._view = View(
             full=full,
             columns=columns(self.full),
             mirrored=self.mirrored,
@@ -339,12 +317,14 @@ class TrackingTask(SpatialTask):
             action_sign=np.zeros(0) if mirror is None else mirror.action_sign,
             action=np.zeros((world.n, len(self.joint_map))),
         )
-        self._view_pack = packed(view)
-        return view
+        self._view_pack = packed(self._view)
+        return self._view
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if act_all(env_ids, action, self._walker_pack, self._view_pack):
-            self._lay_ground(env_ids)
+        if self.mirrored:
+            reflect_all(env_ids, action, self._view_pack)
+            action = self._view.action
+        self.figure.control(env_ids, action)
 
     def _begin_grounds(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]

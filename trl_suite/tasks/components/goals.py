@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.kinematics.blocks import Block, Noise, signs
-from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
-from trl_suite.tasks.task import Marker
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
 
 GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is redrawn
 GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)

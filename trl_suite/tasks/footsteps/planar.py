@@ -15,7 +15,7 @@ import numpy as np
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import has_fallen, measure
+from trl_suite.kinematics.planar import breaks_down, has_fallen, look
 from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
@@ -29,8 +29,8 @@ from trl_suite.tasks.components.footstep_plan import (
 )
 from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.components.plans import options as plans_from
-from trl_suite.tasks.imitation import planar_rules as imitation_rules
-from trl_suite.tasks.imitation.planar import PlanarConfig, PlanarImitation
+from trl_suite.tasks.imitation import planar as imitation
+from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
 from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar import windows as planar_ground
@@ -92,46 +92,43 @@ class Options(NamedTuple):
 
 
 @compiled
-def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+def finish_step(i: int, data: ImitationData, plan: Plan, options: Options) -> None:
     """Computes landing, reward, failure and observation, after the physics was advanced."""
-    imitation_rules.advance_clock(i, rules.clip, rules.state)
-    diverged = imitation_rules.breaks_down(i, rules)
-    missed = land(i, diverged, rules, plan, options)
-    if diverged:
-        conclude(i, True, rules.outcome)
+    imitation.advance_clock(i, data.clip, data.state)
+    body, outcome = data.body, data.outcome
+    outcome.diverged[i] = breaks_down(i, body)
+    missed = land(i, data, plan, options)
+    if outcome.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, outcome)
         return
-    measure(
-        i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
-    )
-    compare(i, rules, plan, options)
-    conclude(i, missed or has_fallen(i, rules.body, rules.physics), rules.outcome)
-    observe(i, rules, plan, options)
+    look(i, body, outcome.observation)
+    compare(i, data, plan, options)
+    conclude(i, missed or has_fallen(i, body.ids, body.physics), outcome)
+    observe(i, data, plan, options)
 
 
 @compiled
-def read_clock(i: int, rules: imitation_rules.Rules) -> int:
+def read_clock(i: int, data: ImitationData) -> int:
     """Writes the phase; returns the stance foot that it implies."""
-    cycles = np.rint(rules.state.cycles[i] * _DIGITS) / _DIGITS
-    rules.state.phase[i] = cycles % 1.0
-    return LEFT if rules.state.phase[i] >= 0.5 else RIGHT
+    cycles = np.rint(data.state.cycles[i] * _DIGITS) / _DIGITS
+    data.state.phase[i] = cycles % 1.0
+    return LEFT if data.state.phase[i] >= 0.5 else RIGHT
 
 
 @compiled
-def land(
-    i: int, diverged: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
-) -> bool:  # fmt: skip
+def land(i: int, data: ImitationData, plan: Plan, options: Options) -> bool:
     """At a switch of stance, writes landing error and next plan; returns whether the step failed."""
-    stance = read_clock(i, rules)
-    plan.landed[i] = stance != plan.stance[i] and not diverged
+    stance, body = read_clock(i, data), data.body
+    plan.landed[i] = stance != plan.stance[i] and not data.outcome.diverged[i]
     if not plan.landed[i]:
         return False
     plan.stance[i] = stance  # the foot that has just landed
-    foot = rules.physics.xpos[i, rules.body.effectors[stance], 0]
+    foot = body.physics.xpos[i, body.ids.effectors[stance], 0]
     plan.landing_error[i] = abs(foot - plan.landing[i, 0, 0])
     for axis in range(3):
         plan.landing[i, 0, axis] = plan.landing[i, 1, axis]
     plan.landing[i, 1, 0] += next_length(i, plan, options)
-    put_on_ground(i, rules, plan)
+    put_on_ground(i, data, plan)
     return plan.landing_error[i] > options.max_landing_error
 
 
@@ -144,36 +141,37 @@ def next_length(i: int, plan: Plan, options: Options) -> float:
 
 
 @compiled
-def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
+def put_on_ground(i: int, data: ImitationData, plan: Plan) -> None:
     """Writes ground heights to the landing places, and the clock and root position to `begun`."""
     for which in range(2):
         x = plan.landing[i, which, 0]
-        plan.landing[i, which, 2] = planar_ground.height(i, x, rules.ground)
-    plan.begun[i, 0] = rules.state.cycles[i]
-    plan.begun[i, 1] = rules.physics.qpos[i, rules.body.qpos[0]]
+        plan.landing[i, which, 2] = planar_ground.height(i, x, data.body.ground)
+    plan.begun[i, 0] = data.state.cycles[i]
+    plan.begun[i, 1] = data.body.physics.qpos[i, data.body.ids.qpos[0]]
 
 
 @compiled
-def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+def compare(i: int, data: ImitationData, plan: Plan, options: Options) -> None:
     """Writes the reward terms; in the second half of a step the plan replaces the clip."""
-    pose, velocity, _, com, height = imitation_rules.errors(i, rules)
-    columns, measurement = rules.features, rules.measurement
-    phase, swing = rules.state.phase[i], 1 - plan.stance[i]
+    pose, velocity, _, com, height = imitation.errors(i, data)
+    columns, body = data.features, data.body
+    measurement = body.measurement
+    phase, swing = data.state.phase[i], 1 - plan.stance[i]
     twice = 2 * phase
     late = twice - np.floor(twice) > 0.5
     end_effector = 0.0
     for k in range(measurement.effectors.shape[1]):
         if k == swing and late:
             continue  # compared with the landing place below
-        off = measurement.effectors[i, k] - feature(phase, columns.effectors + k, rules.clip)
+        off = measurement.effectors[i, k] - feature(phase, columns.effectors + k, data.clip)
         end_effector += off * off
     if late:
-        foot = rules.body.effectors[swing]
-        raised = feature(phase, columns.effectors + 2 + swing, rules.clip)
-        x = plan.landing[i, 0, 0] - rules.physics.xpos[i, foot, 0]
-        z = plan.landing[i, 0, 2] - rules.physics.xpos[i, foot, 2] + raised
+        foot = body.ids.effectors[swing]
+        raised = feature(phase, columns.effectors + 2 + swing, data.clip)
+        x = plan.landing[i, 0, 0] - body.physics.xpos[i, foot, 0]
+        z = plan.landing[i, 0, 2] - body.physics.xpos[i, foot, 2] + raised
         end_effector += options.footstep_scale * (x * x + z * z)
-    terms, outcome = rules.terms, rules.outcome
+    terms, outcome = data.terms, data.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, end_effector, terms.end_effector, outcome)
@@ -183,70 +181,64 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
 
 
 @compiled
-def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+def observe(i: int, data: ImitationData, plan: Plan, options: Options) -> None:
     """Writes the blocks after velocity: strain, phase, contact and plan."""
-    imitation_rules.observe(i, rules)
-    observation, body, physics = rules.outcome.observation, rules.body, rules.physics
-    columns = rules.columns
-    for k in range(len(body.contact)):
-        touches = physics.sensordata[i, body.contact[k]] > 0.0
+    imitation.observe(i, data)
+    observation, columns = data.outcome.observation, data.columns
+    ids, physics, measurement = data.body.ids, data.body.physics, data.body.measurement
+    for k in range(len(ids.contact)):
+        touches = physics.sensordata[i, ids.contact[k]] > 0.0
         observation[i, columns.contact + k] = 1.0 if touches else 0.0
     for k in range(12):
         observation[i, columns.plan + k] = 0.0
     for which in range(2):  # first and second landing place, relative to the foot that lands there
         foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
-        x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
+        x = plan.landing[i, which, 0] - physics.xpos[i, ids.effectors[foot], 0]
         place = columns.plan + 6 * which + 3 * foot
-        observation[i, place] = x * rules.measurement.facing[i]
-        observation[i, place + 2] = plan.landing[i, which, 2] - rules.measurement.under[i]
+        observation[i, place] = x * measurement.facing[i]
+        observation[i, place + 2] = plan.landing[i, which, 2] - measurement.under[i]
 
 
 @compiled
-def draw_plan(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+def draw_plan(i: int, data: ImitationData, plan: Plan, options: Options) -> None:
     """Draws the first plan of an episode."""
-    plan.stance[i] = read_clock(i, rules)
+    plan.stance[i] = read_clock(i, data)
     plan.landing_error[i], plan.landed[i] = 0.0, False
     plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
-    foot = rules.physics.xpos[i, rules.body.effectors[plan.stance[i]], 0]
+    foot = data.body.physics.xpos[i, data.body.ids.effectors[plan.stance[i]], 0]
     plan.landing[i, 0, 0] = foot + next_length(i, plan, options)
     plan.landing[i, 1, 0] = plan.landing[i, 0, 0] + next_length(i, plan, options)
-    put_on_ground(i, rules, plan)
+    put_on_ground(i, data, plan)
 
 
 # Loops over simulations; they take packs.
 
 
 @compiled_loop
-def draw_plans(
-    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
-) -> None:
+def draw_plans(env_ids: np.ndarray, data: ImitationData, plan: Plan, options: Options) -> None:
     """Draws the first plans of some simulations."""
     for i in env_ids:
-        draw_plan(i, rules, plan, options)
+        draw_plan(i, data, plan, options)
 
 
 @compiled_loop
-def finish_steps(
-    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
-) -> None:
+def finish_steps(env_ids: np.ndarray, data: ImitationData, plan: Plan, options: Options) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish_step(i, rules, plan, options)
+        finish_step(i, data, plan, options)
 
 
 @compiled_loop
 def observe_all(
-    env_ids: np.ndarray, fresh: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
+    env_ids: np.ndarray, fresh: bool, data: ImitationData, plan: Plan, options: Options
 ) -> None:
     """Writes observations; if `fresh`, episodes have just begun, and outcomes are reset."""
     for i in env_ids:
-        measure(
-            i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
-        )
-        compare(i, rules, plan, options)
-        observe(i, rules, plan, options)
+        look(i, data.body, data.outcome.observation)
+        compare(i, data, plan, options)
+        observe(i, data, plan, options)
         if fresh:
-            begin(i, rules.outcome)
+            begin(i, data.outcome)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

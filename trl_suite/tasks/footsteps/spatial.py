@@ -37,7 +37,6 @@ from trl_suite.tasks.components.plans import (
     Pushes,
     options,
 )
-from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.footsteps.spatial_plans import Planner
 from trl_suite.tasks.footsteps.spatial_rules import (
     TERMS,
@@ -48,7 +47,7 @@ from trl_suite.tasks.footsteps.spatial_rules import (
     observe_all,
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
-from trl_suite.tasks.task import Marker
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
 
@@ -160,7 +159,8 @@ class SpatialFootsteps(TrackingTask):
         )  # fmt: skip
         limit = self.max_landing_error
         data = FootstepData(
-            walker=self.walker,
+            body=self.figure.data,
+            outcome=self.outcome,
             seen=view,
             clock=self.clock,
             travel=self.travel,

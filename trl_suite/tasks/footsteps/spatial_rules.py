@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_reference import feature, moment
 from trl_suite.tasks.components.comparison import (
     Comparison,
@@ -24,15 +24,13 @@ from trl_suite.tasks.components.spatial_rules import (
     Clock,
     Travel,
     View,
-    WalkerData,
-    breaks_down,
-    measure_travel,
+    look_and_travel,
     observe_body,
     observe_phase,
     publish,
     tick,
 )
-from trl_suite.tasks.task import conclude
+from trl_suite.tasks.task import Outcome, conclude
 from trl_suite.tasks.terms import Term, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, compiled_loop
 
@@ -82,7 +80,8 @@ class FootstepData(NamedTuple):
       largest_miss: landing error above which the episode fails, m.
     """
 
-    walker: WalkerData
+    body: SpatialBodyData
+    outcome: Outcome
     seen: View
     clock: Clock
     travel: Travel
@@ -104,10 +103,11 @@ def land(i: int, data: FootstepData) -> bool:
     plan, state, clock = data.plan, data.state, data.clock
     tick(i, data.period, clock)
     plan.landed[i] = state.missed[i] = False
-    if breaks_down(i, data.walker):
+    data.outcome.diverged[i] = breaks_down(i, data.body)
+    if data.outcome.diverged[i]:
         return False
-    measure_travel(i, data.walker, data.travel)
-    plan.landed[i] = update_stance(i, clock.phase[i], data.walker.measurement, plan)
+    look_and_travel(i, data.body, data.travel)
+    plan.landed[i] = update_stance(i, clock.phase[i], data.body.measurement, plan)
     if plan.landed[i] and plan.landing_error[i] > data.largest_miss:
         state.missed[i] = clock.steps[i] > state.excused[i]
     return plan.landed[i]
@@ -116,12 +116,12 @@ def land(i: int, data: FootstepData) -> bool:
 @compiled
 def finish(i: int, data: FootstepData) -> None:
     """Computes reward, failure and observation."""
-    outcome = data.walker.outcome
+    outcome = data.outcome
     if outcome.diverged[i]:  # keeps the last finite observation
         conclude(i, True, outcome)
         return
     compare(i, data)
-    conclude(i, data.walker.measurement.fallen[i] or data.state.missed[i], outcome)
+    conclude(i, data.body.measurement.fallen[i] or data.state.missed[i], outcome)
     observe(i, data)
 
 
@@ -135,7 +135,7 @@ def step_phase(phase: float) -> float:
 def compare(i: int, data: FootstepData) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
     plan, state, comparison = data.plan, data.state, data.comparison
-    measurement, tracks = data.walker.measurement, comparison.tracks
+    measurement, tracks = data.body.measurement, comparison.tracks
     share = step_phase(data.clock.phase[i])
     row, fraction = moment(share, state.track[i], tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
@@ -158,7 +158,7 @@ def compare(i: int, data: FootstepData) -> None:
             if k == 2:
                 off += feature(row, fraction, column, tracks)
             step += off * off
-    terms, outcome = comparison.terms, data.walker.outcome
+    terms, outcome = comparison.terms, data.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, com, terms.com, outcome)
@@ -175,16 +175,16 @@ def compare(i: int, data: FootstepData) -> None:
 @compiled
 def observe(i: int, data: FootstepData) -> None:
     """Writes the observation."""
-    walker, columns, full = data.walker, data.seen.columns, data.seen.full
-    measurement = walker.measurement
-    observe_body(i, columns, walker, full)
+    body, columns, full = data.body, data.seen.columns, data.seen.full
+    measurement = body.measurement
+    observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
     observe_plan(i, columns, measurement, data.plan, full)
     if columns.goal >= 0:
         x = data.state.goal[i, 0] - measurement.root[i, 0]
         y = data.state.goal[i, 1] - measurement.root[i, 1]
         full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.seen, walker.outcome)
+    publish(i, data.seen, data.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -210,6 +210,6 @@ def finish_all(env_ids: np.ndarray, data: FootstepData) -> None:
 def observe_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
-        measure_travel(i, data.walker, data.travel)
+        look_and_travel(i, data.body, data.travel)
         compare(i, data)
         observe(i, data)

@@ -15,7 +15,7 @@ from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
 from trl_suite.kinematics.blocks import Block
 from trl_suite.kinematics.planar import (
-    PlanarBody,
+    PlanarIds,
     PlanarMeasurement,
     is_lost,
     leaves,
@@ -25,7 +25,6 @@ from trl_suite.tasks.task import (
     Outcome,
     begin,
     conclude,
-    too_fast,
 )
 from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar.windows import PlanarWindows
@@ -148,7 +147,7 @@ class Rules(NamedTuple):
     """
 
     engine: native.Engine
-    body: PlanarBody
+    body: PlanarIds
     ground: PlanarWindows
     gait: GaitRules
     ctrl: np.ndarray
@@ -203,7 +202,7 @@ def go_on(i: int, watched: bool, rules: Rules) -> int:
     state, options = rules.state, rules.options
     while state.going[i]:
         if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
-            i, rules.body, rules.gait.physics, rules.ground, rules.measurement
+            i, rules.body, rules.gait.physics, rules.ground
         ):
             return _GROUND
         gaits.act(i, rules.gait)
@@ -270,7 +269,7 @@ def breaks_down(i: int, rules: Rules) -> bool:
     joints = rules.body.dof[3:]
     diverged = (
         native.diverged(i, rules.engine)
-        or too_fast(i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel)
+        or native.too_fast(i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel)
         or is_lost(i, rules.body, rules.gait.physics, rules.ground)
     )
     rules.outcome.diverged[i] = diverged

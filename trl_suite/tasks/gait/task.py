@@ -21,7 +21,7 @@ from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import layout
-from trl_suite.kinematics.planar import PlanarBody
+from trl_suite.kinematics.planar import PlanarIds
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.gait.rules import (
@@ -205,14 +205,14 @@ class GaitTask(Task):
             terms=terms_data(self.terms),
             measured=np.zeros((n, sum(block.size for block in figure.blocks))),
             interruption=np.zeros(n, int),
-            measurement=figure.empty_measurement(),
+            measurement=figure.measurement,
             state=self.state,
             outcome=self.outcome,
         )
         self._pack = packed(self.rules)
         self._start = self._start_pose()
 
-    def _options(self, body: PlanarBody) -> Options:
+    def _options(self, body: PlanarIds) -> Options:
         parameters, spec = self.gait.parameters, self.character.spec
         scope = f'{self.character.mjcf_model.model}/'
         controls = self.world.control_addresses([scope + name for name in spec.joints])
@@ -237,7 +237,7 @@ class GaitTask(Task):
             pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
         )
 
-    def _columns(self, body: PlanarBody) -> np.ndarray:
+    def _columns(self, body: PlanarIds) -> np.ndarray:
         """Returns the columns of the measurement in an observation, by stance leg, (2, size)."""
         links = self.character.spec.links
         order = np.arange(len(links))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,41 +19,193 @@ from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import Block, by_name, columns
+from trl_suite.kinematics.blocks import CLOCK, Block, Noise, by_name, columns
+from trl_suite.kinematics.planar import PlanarBodyData, breaks_down, has_fallen, look
 from trl_suite.kinematics.planar_figure import PlanarFigure
-from trl_suite.kinematics.planar_reference import Reference
+from trl_suite.kinematics.planar_reference import ClipTable, Reference, feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.footstep_plan import CONTACT
-from trl_suite.tasks.imitation.planar_rules import (
+from trl_suite.tasks.components.rewards import COM_ERROR_FACTOR
+from trl_suite.tasks.task import (
     ACTION_OFFSETS,
     CONTROL_TIMESTEP,
-    PHASE_BINS,
-    SUBSTEPS,
-    VIEW_AHEAD,
-    VIEW_BEHIND,
-    ImitationState,
-    Rules,
-    apply_actions,
-    finish_steps,
-    motion_blocks,
-    observe_all,
-)
-from trl_suite.tasks.task import (
     MOST_SAMPLES,
     MOST_SUBSTEPS,
+    PHASE_BINS,
     SPAWNS,
     START_PHASE,
+    SUBSTEPS,
     TERRAIN_LEVEL,
+    Outcome,
     Task,
+    begin,
     check_position_options,
+    conclude,
     drawn_seed,
     start_phases,
 )
-from trl_suite.tasks.terms import terms_data
+from trl_suite.tasks.terms import score, terms_data, wrapped
 from trl_suite.terrain import PlanarGround
-from trl_suite.util.compiled import packed
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import Config, option
+
+VIEW_BEHIND = 0.5  # m; terrain samples begin this far behind the root
+VIEW_AHEAD = 3.0  # m; they end this far ahead of it
+
+
+class ImitationState(NamedTuple):
+    """Clip time of each simulation, (n,).
+
+    Attributes:
+      phase: phase of the clip, in [0, 1).
+      cycles: number of clip periods, with fraction: the phase before it is wrapped.
+      start: `cycles` at the start of the episode.
+    """
+
+    phase: np.ndarray
+    cycles: np.ndarray
+    start: np.ndarray
+
+
+class ImitationData(NamedTuple):
+    """Data of the compiled functions of imitation.
+
+    Attributes:
+      features: first column of each feature in the clip's table.
+      columns: first column of each block in the observation.
+      terms: the reward terms.
+      weights: weights of pitch and joints in the pose and velocity errors, (1 + J,).
+      rest: tendon length of each muscle at zero strain, m.
+      scale: change of tendon length of each muscle per unit of strain, m.
+    """
+
+    body: PlanarBodyData
+    clip: ClipTable
+    features: Any
+    columns: Any
+    terms: Any
+    weights: np.ndarray
+    rest: np.ndarray
+    scale: np.ndarray
+    state: ImitationState
+    outcome: Outcome
+
+
+# The step of simulation i. Functions are in the order in which they are called.
+
+
+@compiled
+def finish_step(i: int, data: ImitationData) -> None:
+    """Computes reward, failure and observation after the physics step."""
+    advance_clock(i, data.clip, data.state)
+    body, outcome = data.body, data.outcome
+    outcome.diverged[i] = breaks_down(i, body)
+    if outcome.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, outcome)
+        return
+    look(i, body, outcome.observation)
+    compare(i, data)
+    conclude(i, has_fallen(i, body.ids, body.physics), outcome)
+    observe(i, data)
+
+
+@compiled
+def advance_clock(i: int, clip: ClipTable, state: ImitationState) -> None:
+    """Advances the phase by a control step."""
+    state.cycles[i] += CONTROL_TIMESTEP / clip.period
+    state.phase[i] = state.cycles[i] % 1.0
+
+
+@compiled
+def errors(i: int, data: ImitationData) -> tuple[float, float, float, float, float]:
+    """Returns the errors of pose, velocity, end effectors, centre of mass and height of the root."""
+    ids, physics, clip, columns = data.body.ids, data.body.physics, data.clip, data.features
+    phase, measurement = data.state.phase[i], data.body.measurement
+    pose = velocity = 0.0
+    for k in range(len(data.weights)):  # pitch, then joints
+        angle = physics.qpos[i, ids.qpos[2 + k]] - feature(phase, columns.angles + k, clip)
+        if k == 0:
+            angle = wrapped(angle)
+        rate = physics.qvel[i, ids.dof[2 + k]] - feature(phase, columns.rates + k, clip)
+        pose += data.weights[k] * (angle * angle)
+        velocity += data.weights[k] * (rate * rate)
+    end_effector, count = 0.0, measurement.effectors.shape[1]
+    for k in range(count):
+        off = measurement.effectors[i, k] - feature(phase, columns.effectors + k, clip)
+        end_effector += off * off
+    com = 0.0
+    for k in range(2):
+        off = measurement.com_velocity[i, k] - feature(phase, columns.com_velocity + k, clip)
+        com += COM_ERROR_FACTOR * (off * off)
+    height = measurement.height[i] - feature(phase, columns.height, clip)
+    return pose, velocity, end_effector / (count // 2), com, height * height
+
+
+@compiled
+def compare(i: int, data: ImitationData) -> None:
+    """Writes the reward terms."""
+    pose, velocity, end_effector, com, height = errors(i, data)
+    terms, outcome = data.terms, data.outcome
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)
+
+
+@compiled
+def observe(i: int, data: ImitationData) -> None:
+    """Writes the blocks after terrain, pose and velocity: strain, and phase or reference."""
+    columns, features, observation = data.columns, data.features, data.outcome.observation
+    phase = data.state.phase[i]
+    for k in range(len(data.rest)):
+        length = data.body.physics.ten_length[i, k] - data.rest[k]
+        observation[i, columns.strain + k] = length / data.scale[k]
+    if columns.phase >= 0:
+        for k in range(1 + PHASE_BINS):
+            observation[i, columns.phase + k] = feature(phase, features.phase + k, data.clip)
+    if columns.reference >= 0:  # height, positions and velocities
+        for k in range(features.root_rate - features.height):
+            value = feature(phase, features.height + k, data.clip)
+            observation[i, columns.reference + k] = value
+
+
+def motion_blocks(muscles: int, links: int, reference: bool) -> tuple[Block, ...]:
+    """Returns the blocks that `observe` writes; `reference`: instead of the phase."""
+    return (
+        Block('strain', muscles, '1', 'strain of each muscle fibre', Noise((0.003, 0.01, 0.02))),
+        Block(
+            'phase', 0 if reference else 1 + PHASE_BINS, '1',
+            'phase of the clip in [0, 1); then the one-hot of its quarter', CLOCK,
+        ),
+        Block(
+            'reference', 4 * links + 1 if reference else 0, 'm, m/s',
+            'root height, link centres from the root, and velocities of link centres of the reference',
+            'the reference is known to the controller',
+        ),
+    )  # fmt: skip
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def finish_steps(env_ids: np.ndarray, data: ImitationData) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish_step(i, data)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, data: ImitationData) -> None:
+    """Writes observations; if `fresh`, episodes have just begun, and outcomes are reset."""
+    for i in env_ids:
+        look(i, data.body, data.outcome.observation)
+        compare(i, data)
+        observe(i, data)
+        if fresh:
+            begin(i, data.outcome)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -184,11 +336,7 @@ class PlanarImitation(Task):
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure, spec = self.figure, self.character.spec
-        figure.bind(world, self.blocks, self.ABOUT)
-        scope = f'{self.character.mjcf_model.model}/'
-        controls = world.control_addresses([scope + name for name in self.action_map.names])
-        # The controls are consecutive.
-        drive = self.action_map.drive(int(controls[0]))
+        figure.bind(world, self.blocks, self.ABOUT, self.action_map)
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
@@ -196,28 +344,22 @@ class PlanarImitation(Task):
         self.state = ImitationState(*np.zeros((3, n)))
         self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
         self.saved = (self.state, self.outcome)
-        self._measurement = figure.empty_measurement()
-        self.rules = Rules(
-            engine=world.engine,
-            body=figure.body,
-            physics=figure.state,
-            ground=figure.ground,
-            clip=self.reference.clip_table,
-            drive=drive,
-            ctrl=world.ctrl,
-            features=by_name(
-                'Features', {name: part.start for name, part in self.reference.columns.items()}
-            ),
-            columns=columns(self.observed),
-            terms=terms_data(self.terms),
-            weights=np.asarray(spec.weights),
-            rest=self._rest,
-            scale=self._scale,
-            measurement=self._measurement,
-            state=self.state,
-            outcome=self.outcome,
+        self._pack = packed(
+            ImitationData(
+                body=figure.data,
+                clip=self.reference.clip_table,
+                features=by_name(
+                    'Features', {name: part.start for name, part in self.reference.columns.items()}
+                ),
+                columns=columns(self.observed),
+                terms=terms_data(self.terms),
+                weights=np.asarray(spec.weights),
+                rest=self._rest,
+                scale=self._scale,
+                state=self.state,
+                outcome=self.outcome,
+            )
         )
-        self._pack = packed(self.rules)
 
     @property
     def phase(self) -> np.ndarray:
@@ -254,9 +396,7 @@ class PlanarImitation(Task):
         """Called by `reset` after the characters were placed; for subclasses."""
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if apply_actions(env_ids, action, self._pack):
-            # Before the physics steps, so that images rendered afterwards are up to date.
-            self.figure.follow(env_ids[self._measurement.leaving[env_ids]])
+        self.figure.control(env_ids, action)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         finish_steps(env_ids, self._pack)

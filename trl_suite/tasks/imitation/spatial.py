@@ -15,7 +15,7 @@ from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import Block
-from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, look, polar
 from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
 from trl_suite.motion import Clip, quaternion
 from trl_suite.tasks.components import rewards
@@ -31,16 +31,13 @@ from trl_suite.tasks.components.spatial_rules import (
     Clock,
     Travel,
     View,
-    WalkerData,
-    breaks_down,
-    measure,
     observe_body,
     observe_phase,
     publish,
     tick,
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
-from trl_suite.tasks.task import conclude, drawn_seed
+from trl_suite.tasks.task import Outcome, conclude, drawn_seed
 from trl_suite.tasks.terms import score
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
@@ -55,7 +52,8 @@ TYPICAL_POSES = 256  # poses of a cycle; their mean is action 0 of position cont
 class ImitationData(NamedTuple):
     """Data for the compiled functions of imitation; `period`: that of the clip, s."""
 
-    walker: WalkerData
+    body: SpatialBodyData
+    outcome: Outcome
     seen: View
     clock: Clock
     travel: Travel
@@ -69,33 +67,34 @@ class ImitationData(NamedTuple):
 @compiled
 def finish_step(i: int, data: ImitationData) -> None:
     """Computes reward, failure and observation, after the physics was advanced."""
-    walker = data.walker
+    body = data.body
     tick(i, data.period, data.clock)
-    if breaks_down(i, walker):
-        conclude(i, True, walker.outcome)
+    data.outcome.diverged[i] = breaks_down(i, body)
+    if data.outcome.diverged[i]:
+        conclude(i, True, data.outcome)
         return
-    look(i, data)
+    measure(i, data)
     compare(i, data)
-    conclude(i, walker.measurement.fallen[i], walker.outcome)
+    conclude(i, body.measurement.fallen[i], data.outcome)
     observe(i, data)
 
 
 @compiled
-def look(i: int, data: ImitationData) -> None:
+def measure(i: int, data: ImitationData) -> None:
     """Measures the body, and the distance travelled along +x."""
-    measure(i, data.walker)
-    data.travel.distance[i] = data.walker.measurement.root[i, 0] - data.travel.origin[i, 0]
+    look(i, data.body)
+    data.travel.distance[i] = data.body.measurement.root[i, 0] - data.travel.origin[i, 0]
 
 
 @compiled
 def compare(i: int, data: ImitationData) -> None:
     """Writes the reward terms, from errors of pose, velocities and end effectors."""
-    comparison, measurement = data.comparison, data.walker.measurement
+    comparison, measurement = data.comparison, data.body.measurement
     row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
     com = com_error(i, row, fraction, 0.0, comparison, measurement)
-    terms, outcome = comparison.terms, data.walker.outcome
+    terms, outcome = comparison.terms, data.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, end_effector, terms.end_effector, outcome)
@@ -106,21 +105,19 @@ def compare(i: int, data: ImitationData) -> None:
 @compiled
 def observe(i: int, data: ImitationData) -> None:
     """Writes the observation."""
-    walker, columns, full = data.walker, data.seen.columns, data.seen.full
-    observe_body(i, columns, walker, full)
+    body, columns, full = data.body, data.seen.columns, data.seen.full
+    observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
     if columns.reference >= 0:
         tracks, features = data.comparison.tracks, data.comparison.columns
         row, fraction = moment(data.clock.phase[i], 0, tracks)
         full[i, columns.reference] = feature(row, fraction, features.height, tracks)
-        for k in range(6 * len(walker.body.links)):  # positions and velocities of the links
+        for k in range(6 * len(body.ids.links)):  # positions and velocities of the links
             value = feature(row, fraction, features.positions + k, tracks)
             full[i, columns.reference + 1 + k] = value
-    aside = data.travel.origin[i, 1] - walker.measurement.root[i, 1]
-    full[i, columns.goal], full[i, columns.goal + 1] = polar(
-        i, GOAL_AHEAD, aside, walker.measurement
-    )
-    publish(i, data.seen, walker.outcome)
+    aside = data.travel.origin[i, 1] - body.measurement.root[i, 1]
+    full[i, columns.goal], full[i, columns.goal + 1] = polar(i, GOAL_AHEAD, aside, body.measurement)
+    publish(i, data.seen, data.outcome)
 
 
 def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
@@ -152,7 +149,7 @@ def finish_steps(env_ids: np.ndarray, data: ImitationData) -> None:
 def observe_all(env_ids: np.ndarray, data: ImitationData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
-        look(i, data)
+        measure(i, data)
         compare(i, data)
         observe(i, data)
 
@@ -214,7 +211,8 @@ class SpatialImitation(TrackingTask):
         self.reference = SpatialReference.of_clip(self.clip, self.figure.body, world.models[0])
         self._pack = packed(
             ImitationData(
-                walker=self.walker,
+                body=self.figure.data,
+                outcome=self.outcome,
                 seen=view,
                 clock=self.clock,
                 travel=self.travel,

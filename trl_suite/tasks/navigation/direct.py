@@ -142,7 +142,8 @@ class DirectNavigation(TrackingTask):
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         data = DirectData(
-            walker=self.walker,
+            body=self.figure.data,
+            outcome=self.outcome,
             seen=view,
             clock=self.clock,
             travel=self.travel,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_reference import moment
 from trl_suite.tasks.components.ball import BallRules, dribble, observe_ball, remember
 from trl_suite.tasks.components.comparison import (
@@ -19,20 +19,17 @@ from trl_suite.tasks.components.comparison import (
 from trl_suite.tasks.components.goals import Goals
 from trl_suite.tasks.components.rewards import tracking_terms
 from trl_suite.tasks.components.spatial_rules import (
-    CONTROL_TIMESTEP,
     Clock,
     Travel,
     View,
-    WalkerData,
-    breaks_down,
-    measure_travel,
+    look_and_travel,
     observe_body,
     observe_phase,
     publish,
     tick,
 )
 from trl_suite.tasks.components.trace import Trace, follow
-from trl_suite.tasks.task import conclude
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Outcome, conclude
 from trl_suite.tasks.terms import Term, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, compiled_loop
 
@@ -79,7 +76,8 @@ class DirectData(NamedTuple):
       with_ball: whether the goal is that of a ball.
     """
 
-    walker: WalkerData
+    body: SpatialBodyData
+    outcome: Outcome
     seen: View
     clock: Clock
     travel: Travel
@@ -99,17 +97,18 @@ class DirectData(NamedTuple):
 @compiled
 def advance(i: int, data: DirectData) -> bool:
     """Measures the body and tests goal and ball; returns whether one of them must be redrawn."""
-    walker, goals, state = data.walker, data.goals, data.ball.state
+    body, goals, state = data.body, data.goals, data.ball.state
     tick(i, data.period, data.clock)
     goals.wanted[i] = state.wanted[i] = False
-    if breaks_down(i, walker):
+    data.outcome.diverged[i] = breaks_down(i, body)
+    if data.outcome.diverged[i]:
         return False
-    measure_travel(i, walker, data.travel)
-    count, measurement = data.clock.steps[i], walker.measurement
+    look_and_travel(i, body, data.travel)
+    count, measurement = data.clock.steps[i], body.measurement
     follow(i, count, measurement.com, data.trace)
     if data.with_ball:
         dribble(
-            i, CONTROL_TIMESTEP, goals.place, walker.physics, measurement, data.ball, walker.outcome
+            i, CONTROL_TIMESTEP, goals.place, body.physics, measurement, data.ball, data.outcome
         )
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
@@ -126,24 +125,24 @@ def advance(i: int, data: DirectData) -> bool:
 @compiled
 def finish(i: int, data: DirectData) -> None:
     """Computes reward, failure and observation."""
-    walker = data.walker
-    if walker.outcome.diverged[i]:  # keeps the last finite observation
-        conclude(i, True, walker.outcome)
+    body = data.body
+    if data.outcome.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, data.outcome)
         return
     if data.with_ball:
-        remember(i, walker.physics, walker.measurement, data.ball)
+        remember(i, body.physics, body.measurement, data.ball)
     compare(i, data)
-    conclude(i, walker.measurement.fallen[i], walker.outcome)
+    conclude(i, body.measurement.fallen[i], data.outcome)
     observe(i, data)
 
 
 @compiled
 def compare(i: int, data: DirectData) -> None:
     """Writes the reward terms: imitation while walking to the goal, or to the ball."""
-    walker, comparison, measurement = data.walker, data.comparison, data.walker.measurement
+    body, comparison, measurement = data.body, data.comparison, data.body.measurement
     row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
     if data.with_ball:
-        qpos, first = walker.physics.qpos, data.ball.qpos
+        qpos, first = body.physics.qpos, data.ball.qpos
         x, y = qpos[i, first], qpos[i, first + 1]
     else:
         x, y = data.goals.place[i, 0], data.goals.place[i, 1]
@@ -155,7 +154,7 @@ def compare(i: int, data: DirectData) -> None:
     off = 0.0 if near else wrapped(direction - measurement.heading[i])
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
-    terms, outcome = comparison.terms, walker.outcome
+    terms, outcome = comparison.terms, data.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, end_effector, terms.end_effector, outcome)
@@ -170,16 +169,16 @@ def compare(i: int, data: DirectData) -> None:
 @compiled
 def observe(i: int, data: DirectData) -> None:
     """Writes the observation."""
-    walker, columns, full = data.walker, data.seen.columns, data.seen.full
-    measurement, place = walker.measurement, data.goals.place
-    observe_body(i, columns, walker, full)
+    body, columns, full = data.body, data.seen.columns, data.seen.full
+    measurement, place = body.measurement, data.goals.place
+    observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
     if data.with_ball:
-        observe_ball(i, columns, place, walker.physics, measurement, data.ball, full)
+        observe_ball(i, columns, place, body.physics, measurement, data.ball, full)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
         full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.seen, walker.outcome)
+    publish(i, data.seen, data.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -205,11 +204,11 @@ def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
 def observe_all(env_ids: np.ndarray, fresh: bool, data: DirectData) -> None:
     """Measures, writes reward terms for the current state, and observes.
 
-    If `fresh`, episodes have just begun, and positions of ball and walker are stored.
+    If `fresh`, episodes have just begun, and positions of ball and body are stored.
     """
     for i in env_ids:
-        measure_travel(i, data.walker, data.travel)
+        look_and_travel(i, data.body, data.travel)
         if fresh and data.with_ball:
-            remember(i, data.walker.physics, data.walker.measurement, data.ball)
+            remember(i, data.body.physics, data.body.measurement, data.ball)
         compare(i, data)
         observe(i, data)

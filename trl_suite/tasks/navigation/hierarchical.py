@@ -40,11 +40,8 @@ from trl_suite.tasks.components.goal_drawer import GoalDrawer
 from trl_suite.tasks.components.goals import GOAL, flag, goals
 from trl_suite.tasks.components.plans import Plans, span
 from trl_suite.tasks.components.spatial_rules import (
-    CONTROL_TIMESTEP,
     PHASE,
-    SUBSTEPS,
     TERRAIN_MAPS,
-    control_all,
 )
 from trl_suite.tasks.components.trace import trace, trace_markers
 from trl_suite.tasks.navigation.hierarchical_rules import (
@@ -73,7 +70,9 @@ from trl_suite.tasks.navigation.plan_actions import (
 )
 from trl_suite.tasks.spatial_task import SpatialTask, maps
 from trl_suite.tasks.task import (
+    CONTROL_TIMESTEP,
     MOST_SUBSTEPS,
+    SUBSTEPS,
     TERRAIN_LEVEL,
     Marker,
     check_simulated,
@@ -259,7 +258,8 @@ class HierarchicalNavigation(SpatialTask):
         self._joint_action = np.zeros((n, len(self.joint_map)))
         self._pack = packed(
             PlanningData(
-                walker=self.walker,
+                body=self.figure.data,
+                outcome=self.outcome,
                 clock=self.clock,
                 travel=self.travel,
                 period=self.period,
@@ -362,8 +362,7 @@ class HierarchicalNavigation(SpatialTask):
         while len(going):
             if self.interface == 'plan':
                 self._joint_action[going] = self.controller(self._controller_observation[going])
-            if control_all(going, self._joint_action, self._walker_pack):
-                self._lay_ground(going)
+            self.figure.control(going, self._joint_action)
             self.world.step(self.config.substeps, going)
             count = finish_control_steps(going, self._pack)
             if self.watch is not None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.kinematics.blocks import HEIGHTS, Block, Reflection
-from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_figure import LINES
 from trl_suite.tasks.components.ball import (
     BallRules,
@@ -23,18 +23,15 @@ from trl_suite.tasks.components.footstep_plan import (
 )
 from trl_suite.tasks.components.goals import Goals
 from trl_suite.tasks.components.spatial_rules import (
-    CONTROL_TIMESTEP,
     Clock,
     Travel,
-    WalkerData,
-    breaks_down,
-    measure_travel,
+    look_and_travel,
     observe_body,
     observe_phase,
     tick,
 )
 from trl_suite.tasks.components.trace import Trace, follow
-from trl_suite.tasks.task import conclude
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Outcome, conclude
 from trl_suite.tasks.terms import Term, give
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
@@ -114,7 +111,8 @@ class PlanningData(NamedTuple):
       with_ball: whether the goal is that of a ball.
     """
 
-    walker: WalkerData
+    body: SpatialBodyData
+    outcome: Outcome
     clock: Clock
     travel: Travel
     period: float
@@ -142,14 +140,14 @@ class PlanningData(NamedTuple):
 @compiled
 def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan if a footstep begins, and writes the footstep controller's observation."""
-    walker, state = data.walker, data.state
-    measure_travel(i, walker, data.travel)
+    body, state = data.body, data.state
+    look_and_travel(i, body, data.travel)
     lay_plan(i, action, data)
     state.lasted[i] = 0
     for k in range(3):
-        state.begin[i, k] = walker.measurement.com[i, k]
+        state.begin[i, k] = body.measurement.com[i, k]
     if data.with_ball:
-        remember(i, walker.physics, walker.measurement, data.ball)
+        remember(i, body.physics, body.measurement, data.ball)
     data.plan.landed[i] = False
     observe_for_controller(i, data)
 
@@ -157,7 +155,7 @@ def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
 @compiled
 def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan from the action, relative to the root and its heading, if a footstep begins."""
-    plan, measurement, ground = data.plan, data.walker.measurement, data.walker.ground
+    plan, measurement, ground = data.plan, data.body.measurement, data.body.ground
     if not (data.by_plan or plan.landed[i] or data.clock.steps[i] == 0):
         return
     heading = measurement.heading[i]
@@ -180,10 +178,10 @@ def meant(i: int, k: int, action: np.ndarray, data: PlanningData) -> float:
 @compiled
 def observe_for_controller(i: int, data: PlanningData) -> None:
     """Writes the observation of the footstep controller, as in `SpatialFootsteps`."""
-    walker, columns, observation = data.walker, data.controller.columns, data.controller.observation
-    observe_body(i, columns, walker, observation)
+    body, columns, observation = data.body, data.controller.columns, data.controller.observation
+    observe_body(i, columns, body, observation)
     observe_phase(i, columns, data.clock, observation)
-    observe_plan(i, columns, walker.measurement, data.plan, observation)
+    observe_plan(i, columns, body.measurement, data.plan, observation)
 
 
 @compiled
@@ -193,14 +191,15 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     Returns:
       Whether the step continues; the observation of the footstep controller is then written.
     """
-    walker, state, outcome, plan = data.walker, data.state, data.walker.outcome, data.plan
+    body, state, outcome, plan = data.body, data.state, data.outcome, data.plan
     tick(i, data.period, data.clock)
     state.lasted[i] += 1
-    if breaks_down(i, walker):
+    data.outcome.diverged[i] = breaks_down(i, body)
+    if data.outcome.diverged[i]:
         outcome.failed[i] = state.over[i] = True
         return False
-    measure_travel(i, walker, data.travel)
-    count, measurement = data.clock.steps[i], walker.measurement
+    look_and_travel(i, body, data.travel)
+    count, measurement = data.clock.steps[i], body.measurement
     if count % SAMPLE_FRAMES == 0:
         state.down[i] *= CONTACT_DECAY
         state.down[i] += CONTACT_GAIN * measurement.fallen[i]
@@ -219,8 +218,8 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
 @compiled
 def score(i: int, data: PlanningData) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
-    walker, goals, state, ball = data.walker, data.goals, data.state, data.ball.state
-    measurement, outcome = walker.measurement, walker.outcome
+    body, goals, state, ball = data.body, data.goals, data.state, data.ball.state
+    measurement, outcome = body.measurement, data.outcome
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
     goals.wanted[i] = ball.wanted[i] = False
@@ -228,7 +227,7 @@ def score(i: int, data: PlanningData) -> bool:
         return False
     if data.with_ball:
         state.speed[i] = dribble(
-            i, seconds, goals.place, walker.physics, measurement, data.ball, outcome
+            i, seconds, goals.place, body.physics, measurement, data.ball, outcome
         )
     else:
         x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
@@ -265,7 +264,7 @@ def score(i: int, data: PlanningData) -> bool:
 @compiled
 def finish(i: int, data: PlanningData) -> None:
     """Computes reward and observation."""
-    outcome = data.walker.outcome
+    outcome = data.outcome
     conclude(i, outcome.failed[i], outcome)
     if not outcome.diverged[i]:  # otherwise keeps the last finite observation
         observe(i, data)
@@ -274,15 +273,15 @@ def finish(i: int, data: PlanningData) -> None:
 @compiled
 def observe(i: int, data: PlanningData) -> None:
     """Writes the observation."""
-    walker, measurement, columns = data.walker, data.walker.measurement, data.columns
-    observation, place = walker.outcome.observation, data.goals.place
-    observe_body(i, columns, walker, observation)
+    body, measurement, columns = data.body, data.body.measurement, data.columns
+    observation, place = data.outcome.observation, data.goals.place
+    observe_body(i, columns, body, observation)
     if columns.surface >= 0:
         block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
         x, y = measurement.root[i, 0], measurement.root[i, 1]
-        spatial_ground.velocity_map(i, x, y, measurement.heading[i], walker.ground, block)
+        spatial_ground.velocity_map(i, x, y, measurement.heading[i], body.ground, block)
     if data.with_ball:
-        observe_ball(i, columns, place, walker.physics, measurement, data.ball, observation)
+        observe_ball(i, columns, place, body.physics, measurement, data.ball, observation)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
         bearing, distance = polar(i, x, y, measurement)
@@ -307,7 +306,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
 def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
-        measure_travel(i, data.walker, data.travel)
+        look_and_travel(i, data.body, data.travel)
         lay_plan(i, action, data)
         observe_for_controller(i, data)
         observe(i, data)
@@ -342,5 +341,5 @@ def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
 def observe_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Observes."""
     for i in env_ids:
-        measure_travel(i, data.walker, data.travel)
+        look_and_travel(i, data.body, data.travel)
         observe(i, data)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,42 +14,133 @@ from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import columns
+from trl_suite.kinematics import planar, spatial
+from trl_suite.kinematics.blocks import Block, Noise, columns
+from trl_suite.kinematics.planar import PlanarBodyData
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
+from trl_suite.kinematics.spatial import SpatialBodyData
 from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, WalkerData, control_all
-from trl_suite.tasks.imitation.planar_rules import (
-    CONTROL_TIMESTEP,
-    SUBSTEPS,
-    VIEW_AHEAD,
-    VIEW_BEHIND,
-)
+from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, observe_body
+from trl_suite.tasks.imitation.planar import VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.spatial_task import maps
 from trl_suite.tasks.task import (
+    CONTROL_TIMESTEP,
     MOST_SAMPLES,
     MOST_SUBSTEPS,
+    SUBSTEPS,
     TERRAIN_LEVEL,
+    Outcome,
     Task,
     check_position_options,
+    conclude,
     drawn_seed,
 )
-from trl_suite.tasks.walk.rules import (
-    FROUDE,
-    GRAVITY,
-    TARGET_HEADING,
-    PlanarRules,
-    SpatialData,
-    WalkState,
-    act_planar,
-    finish_planar,
-    finish_spatial,
-)
 from trl_suite.terrain import PlanarGround, SpatialGround
-from trl_suite.util.compiled import packed
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import Config, option
+
+FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
+GRAVITY = 9.8  # m/s^2
+
+
+class WalkState(NamedTuple):
+    """State of each walker.
+
+    Attributes:
+      origin: x, y of the start, (n, 2) m.
+      target_heading: direction to walk in, rad to the left of +x, (n,).
+      distance: distance travelled along the target heading, (n,) m.
+    """
+
+    origin: np.ndarray
+    target_heading: np.ndarray
+    distance: np.ndarray
+
+
+class PlanarWalkData(NamedTuple):
+    """Data for the compiled functions of a planar walk."""
+
+    body: PlanarBodyData
+    state: WalkState
+    outcome: Outcome
+
+
+class SpatialWalkData(NamedTuple):
+    """Data for the compiled functions of a spatial walk; `columns`: of the observation blocks."""
+
+    body: SpatialBodyData
+    columns: Any
+    state: WalkState
+    outcome: Outcome
+
+
+# In the plane.
+
+
+@compiled
+def observe_planar(i: int, data: PlanarWalkData) -> None:
+    """Measures and observes."""
+    body = data.body
+    planar.look(i, body, data.outcome.observation)
+    data.state.distance[i] = body.physics.qpos[i, body.ids.qpos[0]] - data.state.origin[i, 0]
+
+
+@compiled_loop
+def finish_planar(env_ids: np.ndarray, stepped: bool, data: PlanarWalkData) -> None:
+    """Finishes steps, or only observes."""
+    for i in env_ids:
+        body, outcome = data.body, data.outcome
+        if stepped:
+            outcome.diverged[i] = planar.breaks_down(i, body)
+            if outcome.diverged[i]:  # keeps the last finite observation
+                conclude(i, True, outcome)
+                continue
+        observe_planar(i, data)
+        if stepped:
+            conclude(i, planar.has_fallen(i, body.ids, body.physics), outcome)
+
+
+# In three dimensions.
+
+
+@compiled
+def observe_spatial(i: int, data: SpatialWalkData) -> None:
+    """Measures and observes."""
+    body, state, columns = data.body, data.state, data.columns
+    observation, measurement = data.outcome.observation, body.measurement
+    spatial.look(i, body)
+    observe_body(i, columns, body, observation)
+    bearing = state.target_heading[i] - measurement.heading[i]
+    observation[i, columns.target_heading] = math.cos(bearing)
+    observation[i, columns.target_heading + 1] = math.sin(bearing)
+    x, y = measurement.root[i, 0] - state.origin[i, 0], measurement.root[i, 1] - state.origin[i, 1]
+    state.distance[i] = (
+        math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
+    )
+
+
+TARGET_HEADING = Block(
+    'target_heading', 2, '1', 'cosine and sine of the bearing of the target heading, the heading at the start',
+    Noise((0.005, 0.02, 0.05)),
+)  # fmt: skip
+
+
+@compiled_loop
+def finish_spatial(env_ids: np.ndarray, stepped: bool, data: SpatialWalkData) -> None:
+    """Finishes steps, or only observes."""
+    for i in env_ids:
+        body, outcome = data.body, data.outcome
+        if stepped:
+            outcome.diverged[i] = spatial.breaks_down(i, body)
+            if outcome.diverged[i]:  # keeps the last finite observation
+                conclude(i, True, outcome)
+                continue
+        observe_spatial(i, data)
+        if stepped:
+            conclude(i, body.measurement.fallen[i], outcome)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -151,10 +243,10 @@ class Walk(Task):
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure = self.figure
-        if isinstance(self.arena, SpatialArena):
-            figure.bind(world)
+        if self._spatial:
+            figure.bind(world, self.action_map)
         else:
-            figure.bind(world, self.blocks)
+            figure.bind(world, self.blocks, action_map=self.action_map)
         self._pose, self._extents = self._posture(world)
         # Height of the root above the ground in the working posture, m.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
@@ -162,26 +254,13 @@ class Walk(Task):
         self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
         self._allocate(n, self.state.distance)
         self.saved = (self.state, self.outcome)
-        scope = f'{self.character.mjcf_model.model}/'
-        # The controls are consecutive.
-        first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
-        common: Any = {
-            'engine': world.engine, 'body': figure.body, 'physics': figure.state,
-            'ground': figure.ground, 'drive': self.action_map.drive(first), 'ctrl': world.ctrl,
-            'outcome': self.outcome,
-        }  # fmt: skip
-        rules: SpatialData | PlanarRules
+        data: SpatialWalkData | PlanarWalkData
         if self._spatial:
-            walker = WalkerData(**common, measurement=figure.measurement, leaving=np.zeros(n, bool))
-            rules = SpatialData(walker, columns(self.observed), self.state)
-            self._leaving = walker.leaving
-            self._act, self._act_pack, self._finish = control_all, packed(walker), finish_spatial
+            data = SpatialWalkData(figure.data, columns(self.observed), self.state, self.outcome)
         else:
-            measurement = figure.empty_measurement()
-            rules = PlanarRules(**common, measurement=measurement, state=self.state)
-            self._leaving = measurement.leaving
-            self._act, self._act_pack, self._finish = act_planar, packed(rules), finish_planar
-        self._pack = packed(rules)
+            data = PlanarWalkData(figure.data, self.state, self.outcome)
+        self._finish = finish_spatial if self._spatial else finish_planar
+        self._pack = packed(data)
 
     @property
     def target_heading(self) -> np.ndarray:
@@ -229,13 +308,7 @@ class Walk(Task):
         self.observe(env_ids)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if self._act(env_ids, action, self._act_pack):
-            # Before the physics steps, so that images rendered afterwards are up to date.
-            leaving = env_ids[self._leaving[env_ids]]
-            if isinstance(self.arena, SpatialArena):
-                self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
-            else:
-                self.figure.follow(leaving)
+        self.figure.control(env_ids, action)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self._finish(env_ids, True, self._pack)
