@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from trl_suite.tasks.components import ball, description, spatial_description
 from trl_suite.tasks.components.description import floats
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
-from trl_suite.tasks.navigation import direct, direct_rules, hierarchical_rules
+from trl_suite.tasks.navigation import direct, hierarchical_rules
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
 
@@ -103,7 +103,7 @@ def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
         yield spatial_description.goal(spec, task, 'near')
     where = 'ball' if of_ball else 'goal'
     notes = [
-        f"com: the clip's velocity is rotated towards the {where}; within {direct_rules.NEAR:g} m of it, com and "
+        f"com: the clip's velocity is rotated towards the {where}; within {direct.NEAR:g} m of it, com and "
         'heading are equal to their weights'
     ]
     if of_ball:
