@@ -12,12 +12,15 @@ import contextlib
 import os
 import pathlib
 import re
+import sys
 import textwrap
 from typing import Any
 
 import trl_suite
 from trl_suite.registry import catalogue
-from trl_suite.viewing import gallery
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent))
+import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 ROOT = DOCS.parent

@@ -19,6 +19,8 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import gallery
+
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.actuation.muscles import MUSCLES
 from trl_suite.describe import common, options
@@ -29,7 +31,6 @@ from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.disturbances import sensors, worlds
 from trl_suite.terrain import checks
 from trl_suite.util import files, resources
-from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 NAMES = (  # parts of ids

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import textwrap
 import threading
-import time
 from unittest import mock
 
 import imageio.v3 as iio
@@ -944,21 +943,6 @@ class ProgramTest(CommandTest):
             (done.returncode, done.stdout, done.stderr), (130, '', 'trl-suite: interrupted\n')
         )
 
-    def test_an_interrupt_of_the_gallery(self):
-        with subprocess.Popen(
-            [sys.executable, '-m', 'trl_suite', 'gallery', '--filter', 'terrains/', '--output', 'all'],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        ) as process:  # fmt: skip
-            while not list(self.folder.rglob('*.jpg')) + list(self.folder.rglob('*.png')):
-                self.assertIsNone(process.poll())
-                time.sleep(0.05)
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=60)
-        self.assertEqual((process.returncode, out), (130, ''))
-        self.assertEndsWith(err, 'trl-suite: interrupted\n')
-        self.assertNotIn('Traceback', err)
-        self.assertEmpty(list(self.folder.rglob('*.part*')))
-
     def test_a_missing_library_while_no_picture_is_asked_for(self):
         with tempfile.TemporaryDirectory() as folder:
             # What PyOpenGL does where the library of OSMesa is not installed.
@@ -1008,14 +992,14 @@ class ReadmeTest(CommandTest):
     @pytest.mark.slow  # .ci/run runs it
     def test_commands_run(self):
         commands = re.findall(r'^(?:.* && \S*/)?trl-suite (.*)$', self.text, re.MULTILINE)
-        self.assertLen(commands, 12)
+        self.assertLen(commands, 11)
         for command in commands:
             if command.startswith('view'):  # serves until it is interrupted
                 continue
             with self.subTest(command):
                 short = (*SIZE, '--steps', '8') if command.startswith('rollout') else ()
                 self.output(*shlex.split(command), *short)
-        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4', 'gallery')
+        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4')
 
 
 if __name__ == '__main__':

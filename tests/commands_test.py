@@ -1,4 +1,4 @@
-"""The commands doctor, bench, gallery and clip, and the functions that they use."""
+"""The commands doctor, bench and clip, and the functions that they use."""
 
 import importlib.metadata
 import json
@@ -12,11 +12,9 @@ import own_test
 from absl.testing import absltest, parameterized
 from PIL import Image
 
-from trl_suite import characters, motion, policies, suite, terrain
+from trl_suite import motion, policies, suite
 from trl_suite.cli import bench, doctor, machine
 from trl_suite.environments import named_policies as acting
-from trl_suite.registry import catalogue
-from trl_suite.viewing import gallery
 
 GAPS = cli_test.GAPS
 SETUP = pathlib.Path(__file__).resolve().parents[1] / 'setup.py'
@@ -220,83 +218,6 @@ class BenchTest(CommandTest):
         self.assert_refused('seconds is 0', 'bench', '--seconds', '0')
         self.assert_refused('folder', 'bench', '--json', 'no/bench.json')
         self.assert_only()
-
-
-class GalleryTest(CommandTest):
-    def test_everything_has_its_pictures(self):
-        items = list(gallery.items())
-        paths = [item.path for item in items]
-        self.assertLen(set(paths), len(paths))
-        trained = list(filter(gallery.record, policies.available()))  # others share a policy
-        for folder, count in (
-            ('environments', len(catalogue.SPECS)), ('characters', len(characters.CHARACTERS)),
-            ('terrains', len(terrain.PRESETS) + len(terrain.PRESETS3D)), ('curves', len(trained)),
-            ('families', len(suite.TASKS_BY_DOMAIN)),
-        ):  # fmt: skip
-            self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
-        self.assertIn('suite.webp', paths)
-        self.assertIn('terrains/gaps.png', paths)
-        self.assertIn('terrains/plane.jpg', paths)
-        sources = [item.path for item in items if item.source]
-        self.assertLen(sources, len(policies.available()) + len(trained))  # film strips and curves
-
-    def test_pictures(self):
-        out = self.output('gallery', '--filter', 'Hopper2D_Terrain_Walls-', '--output', 'g')
-        self.assertEqual(out, '1 picture written to g, 0 failed\n')
-        for only in ('characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}'):
-            self.output('gallery', '--filter', only, '--output', 'g')
-        files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
-        strip = 'FSM_Hopper2D_Terrain_Walls-v0.jpg'
-        self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png'])
-        for path in files.values():
-            self.assertBetween(path.stat().st_size, 1000, gallery.LARGEST)
-            with Image.open(path) as image:
-                self.assertGreater(np.asarray(image.convert('RGB')).std(), 5)
-        with Image.open(files[strip]) as image:
-            height, width = gallery.STRIP_SIZE
-            self.assertEqual(image.size, (6 * width + 5 * 4, height))
-
-    def test_existing_pictures_are_kept(self):
-        old = pathlib.Path('characters')
-        old.mkdir()
-        (old / 'dog.jpg').write_text('mine')
-        out = self.output('gallery', '--filter', 'characters/dog', '--output', '.')
-        self.assertEqual(out, '0 pictures written to ., 0 failed\n')
-        self.assertEqual((old / 'dog.jpg').read_text(), 'mine')
-        self.output('gallery', '--filter', 'characters/dog', '--output', '.', '--overwrite')
-        self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
-
-    def test_pictures_of_a_replaced_policy_are_redrawn(self):
-        only = ('gallery', '--filter', f'curves/{GAPS}', '--output', 'g')
-        for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
-            with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
-                self.assertStartsWith(self.output(*only), f'{count} picture')
-        for suffix in ('.png', '.jpg'):
-            path = self.folder / f'a{suffix}'
-            gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
-            self.assertEqual(gallery._source(path), 'digest')
-
-    def test_an_error_does_not_stop_other_pictures(self):
-        def draw():
-            raise ValueError('no such\nthing')
-
-        items = [
-            gallery.Item('a.png', draw),
-            gallery.Item('b.png', lambda: np.zeros((9, 9, 3), 'u1')),
-        ]
-        with mock.patch.object(gallery, 'items', lambda: iter(items)):
-            status, out, err = run('gallery', '--output', 'g')
-        self.assertEqual((status, out), (1, '1 picture written to g, 1 failed\n'))
-        self.assertEqual(err, 'a.png: no such thing\n')
-        self.assertEqual([path.name for path in pathlib.Path('g').iterdir()], ['b.png'])
-        self.assert_refused("no picture matches 'cat'", 'gallery', '--filter', 'cat')
-
-    def test_noise_becomes_small(self):
-        noise = np.random.default_rng(0).integers(0, 255, (150, 200, 3)).astype(np.uint8)
-        gallery.save(noise, 'noise.jpg')
-        self.assertLess(pathlib.Path('noise.jpg').stat().st_size, gallery.LARGEST)
-        with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'"):
-            gallery.save(noise, 'noise.gif')
 
 
 class ActingTest(parameterized.TestCase):

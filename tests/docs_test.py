@@ -1,32 +1,30 @@
-"""The pages in docs/ and the README: up to date, with existing link targets."""
+"""The pages in docs/ and the README: up to date, with existing link targets; their pictures."""
 
-import importlib.util
 import json
 import pathlib
 import re
+import sys
 from unittest import mock
 
+import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
+from PIL import Image
 
-from trl_suite import describe, suite
+from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.describe import options
 from trl_suite.registry import build, catalogue
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
+import conf
+import gallery
+import generate
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 LARGEST = 12e6  # bytes of all pictures
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f'{name}.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-generate, conf = load('generate'), load('conf')
 
 
 class PagesTest(absltest.TestCase):
@@ -67,6 +65,89 @@ class PagesTest(absltest.TestCase):
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
+
+
+class GalleryTest(FolderTest):
+    def test_everything_has_its_pictures(self):
+        items = list(gallery.items())
+        paths = [item.path for item in items]
+        self.assertLen(set(paths), len(paths))
+        trained = list(filter(gallery.record, policies.available()))  # others share a policy
+        for folder, count in (
+            ('environments', len(catalogue.SPECS)), ('characters', len(characters.CHARACTERS)),
+            ('terrains', len(terrain.PRESETS) + len(terrain.PRESETS3D)), ('curves', len(trained)),
+            ('families', len(suite.TASKS_BY_DOMAIN)),
+        ):  # fmt: skip
+            self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
+        self.assertIn('suite.webp', paths)
+        self.assertIn('terrains/gaps.png', paths)
+        self.assertIn('terrains/plane.jpg', paths)
+        sources = [item.path for item in items if item.source]
+        self.assertLen(sources, len(policies.available()) + len(trained))  # film strips and curves
+
+    def test_pictures(self):
+        for only in (
+            'Hopper2D_Terrain_Walls-',
+            'characters/hopper',
+            'terrains/gaps.png',
+            f'curves/{GAPS}',
+        ):
+            written, failed = gallery.make(self.folder, only)
+            self.assertLen(written, 1)
+            self.assertEmpty(failed)
+        files = {path.name: path for path in self.folder.rglob('*.*g')}
+        strip = 'FSM_Hopper2D_Terrain_Walls-v0.jpg'
+        self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png'])
+        for path in files.values():
+            self.assertBetween(path.stat().st_size, 1000, gallery.LARGEST)
+            with Image.open(path) as image:
+                self.assertGreater(np.asarray(image.convert('RGB')).std(), 5)
+        with Image.open(files[strip]) as image:
+            height, width = gallery.STRIP_SIZE
+            self.assertEqual(image.size, (6 * width + 5 * 4, height))
+
+    def test_existing_pictures_are_kept(self):
+        old = self.folder / 'characters/dog.jpg'
+        old.parent.mkdir()
+        old.write_text('mine')
+        self.assertEqual(gallery.make(self.folder, 'characters/dog'), ([], {}))
+        self.assertEqual(old.read_text(), 'mine')
+        self.assertEqual(gallery.make(self.folder, 'characters/dog', again=True), ([old], {}))
+        self.assertGreater(old.stat().st_size, 1000)
+
+    def test_pictures_of_a_replaced_policy_are_redrawn(self):
+        for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
+            with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
+                self.assertLen(gallery.make(self.folder, f'curves/{GAPS}')[0], count)
+        for suffix in ('.png', '.jpg'):
+            path = self.folder / f'a{suffix}'
+            gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
+            self.assertEqual(gallery._source(path), 'digest')
+
+    def test_an_error_does_not_stop_other_pictures(self):
+        error = ValueError('no such thing')
+
+        def draw():
+            raise error
+
+        items = [
+            gallery.Item('a.png', draw),
+            gallery.Item('b.png', lambda: np.zeros((9, 9, 3), 'u1')),
+        ]
+        with mock.patch.object(gallery, 'items', lambda: iter(items)):
+            found = gallery.make(self.folder)
+        self.assertEqual(found, ([self.folder / 'b.png'], {'a.png': error}))
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['b.png'])
+        with self.assertRaisesRegex(ValueError, "no picture matches 'cat'"):
+            gallery.make(self.folder, 'cat')
+
+    def test_noise_becomes_small(self):
+        noise = np.random.default_rng(0).integers(0, 255, (150, 200, 3)).astype(np.uint8)
+        path = self.folder / 'noise.jpg'
+        gallery.save(noise, path)
+        self.assertLess(path.stat().st_size, gallery.LARGEST)
+        with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'"):
+            gallery.save(noise, path.with_suffix('.gif'))
 
 
 class LeaderboardTest(FolderTest):

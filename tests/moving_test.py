@@ -1,5 +1,7 @@
 """Moving pictures: what is in view, and the files."""
 
+import pathlib
+import sys
 from unittest import mock
 
 import numpy as np
@@ -10,7 +12,10 @@ from PIL import Image
 from trl_suite import suite
 from trl_suite.environments import named_policies
 from trl_suite.rendering.web_scene import root_body
-from trl_suite.viewing import gallery, moving
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
+import gallery
+import moving
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 FOREST = 'PD_Biped3D_HLC_Forest-v0'

@@ -13,7 +13,6 @@
     trl-suite doctor
     trl-suite compile --all
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
-    trl-suite gallery --filter Dog2D_Gaps
     trl-suite sequences run plaid_biped --learner my_module:MyLearner --output result.json
     trl-suite sequences check result.json
 
@@ -50,7 +49,7 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
       prog: name of the program in the help.
 
     Returns:
-      The exit status: 0; 1 if a check of `doctor` or a picture failed; 2 after an error, with one
+      The exit status: 0; 1 if a check of `doctor` failed; 2 after an error, with one
       line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
     arguments = argparse.Namespace()
@@ -304,21 +303,6 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument(
         '--json', type=pathlib.Path, metavar='FILE', help='write all results, .json'
-    )
-
-    command = add('gallery', 'make pictures of all environments, terrains and characters')
-    command.add_argument(
-        '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='output folder'
-    )
-    command.add_argument(
-        '--filter',
-        default='*',
-        metavar='PATTERN',
-        help='part of a path in the folder, as Dog2D_Gaps or terrains',
-    )
-    command.add_argument('--overwrite', action='store_true', help='replace existing pictures')
-    command.add_argument(
-        '--moving', action='store_true', help='only animated pictures of environments'
     )
 
     actions = add('sequences', 'benchmark of continual learning').add_subparsers(

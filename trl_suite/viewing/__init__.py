@@ -1,1 +1,1 @@
-"""Interactive viewing, and the gallery of pictures."""
+"""Interactive viewing."""

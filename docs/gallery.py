@@ -1,12 +1,9 @@
-"""Makes all pictures: environments, terrains, characters, learning curves, and the whole suite.
-
-    trl-suite gallery --output gallery --filter '*Dog2D*'
+"""The pictures of the documentation, which `generate.py` and the configuration of the site make.
 
 Files in the folder: environments/ID.jpg, a film strip; curves/ID.png, for shipped policies;
 terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.webp. Each
-has at most about 40 kB, except the last one and some maps. With --moving, instead of these: moving/ID.webp,
-4 s of each environment. Existing files are kept, unless `--overwrite` is given or the policy that they show
-has been replaced.
+has at most about 40 kB, except the last one and some maps. The site has moving/ID.webp, too, 4 s of
+each environment.
 """
 
 from __future__ import annotations
@@ -24,6 +21,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import moving
 import numpy as np
 import tqdm
 
@@ -35,7 +33,6 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
-from trl_suite.viewing import moving
 
 LARGEST = 40_000  # bytes of a picture
 QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, tried until the file is small enough
@@ -165,7 +162,6 @@ def make(
     folder: files.Path,
     only: str = '*',
     again: bool = False,
-    progress: bool = True,
     moves: bool = False,
 ) -> tuple[list[pathlib.Path], dict[str, Exception]]:
     """Makes the pictures that are missing, or that show a policy that has been replaced.
@@ -175,7 +171,6 @@ def make(
       only: shell-style pattern of paths in the folder, in upper or lower case; `*` is added on both
         sides.
       again: whether to replace existing pictures.
-      progress: whether to show a progress bar.
       moves: make the animated pictures of environments instead of the others.
 
     Returns:
@@ -198,7 +193,7 @@ def make(
         )
     written: list[pathlib.Path] = []
     failed: dict[str, Exception] = {}
-    with tqdm.tqdm(chosen, unit='picture', disable=None if progress else True) as bar:
+    with tqdm.tqdm(chosen, unit='picture', disable=None) as bar:
         for item in bar:
             path = folder / item.path
             if path.exists() and not again and item.source in ('', _source(path)):
