@@ -25,7 +25,7 @@ import os
 import resource
 
 from trl_suite.cli import bench
-from trl_suite.cli.bench import actions, rate, raw, warmed
+from trl_suite.cli.bench import actions, rate, raw
 
 IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
@@ -48,22 +48,9 @@ def measurement(num_envs, threads):
     return f'{num_envs} simulations, {threads} threads'
 
 
-def ours(id_, num_envs, threads, seconds):
-    """Measures rate, serial part, reset cost and projection, and the rate of MuJoCo alone."""
-    found = bench.vector(id_, num_envs, threads, seconds)
-    result = {
-        'control steps per second': round(found['control']),
-        'serial, us per simulation': round(found['serial'], 3),
-        'reset, ms per simulation': round(found['reset'], 3),
-        'share of resets': round(found['resets'], 3),
-        'projection': bench.projection(found, threads),
-    }
-    return result, found['engine'] / SUBSTEPS
-
-
 def footprint(id_, num_envs):
     """Resident memory of this process after making and stepping simulations, bytes."""
-    environments, _ = warmed(id_, num_envs, max(THREADS))
+    environments, _ = bench.warmed(id_, num_envs, max(THREADS))
     found = resident()
     environments.close()
     return found
@@ -77,15 +64,6 @@ def memory(id_):
         with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
             sizes.append(pool.submit(footprint, id_, num_envs).result())
     return (sizes[1] - sizes[0]) / (MEMORY_ROWS[1] - MEMORY_ROWS[0])
-
-
-def single(id_, seconds):
-    """Measures a single environment with resets, and raw mj_step of its model from its start."""
-    found = bench.single(id_, seconds)
-    return {
-        'raw mj_step': found['mj_step'] / SUBSTEPS,
-        'single environment': found['environment'],
-    }
 
 
 def peers(seconds):
@@ -159,7 +137,7 @@ def plot(figures, path):
 
     figure, axes = pyplot.subplots(figsize=(9, 4))
     for k, (id_, found) in enumerate(figures['ours'].items()):
-        reference = figures['single'][id_]['raw mj_step']
+        reference = figures['single'][id_]['mj_step'] / SUBSTEPS
         for threads in THREADS:
             sizes = [n for n in SIZES if measurement(n, threads) in found]
             rates = [
@@ -188,21 +166,19 @@ def main():
     parser.add_argument('--num-envs', type=int, nargs='*', default=SIZES)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
-    figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'engine alone': {}}
-    figures['memory per simulation, kB'] = {}
+    figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'memory per simulation, kB': {}}
     for id_ in IDS:
-        figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
+        figures['single'][id_] = bench.single(id_, arguments.seconds)
         print(id_, figures['single'][id_])
         figures['memory per simulation, kB'][id_] = round(memory(id_) / 1e3)
         print(f'  memory per simulation: {figures["memory per simulation, kB"][id_]} kB')
-        figures['ours'][id_], figures['engine alone'][id_] = {}, {}
+        figures['ours'][id_] = {}
         for threads in THREADS:
             for num_envs in arguments.num_envs:
                 name = measurement(num_envs, threads)
-                found, speed = ours(id_, num_envs, threads, arguments.seconds)
+                found = bench.vector(id_, num_envs, threads, arguments.seconds)
                 figures['ours'][id_][name] = found
-                figures['engine alone'][id_][name] = round(speed)
-                print(f'  {name}: {found}, the engine alone {speed:.0f}/s', flush=True)
+                print(f'  {name}: {found}', flush=True)
     if not arguments.no_peers:
         figures['peers'] = peers(arguments.seconds)
         for name, value in figures['peers'].items():

@@ -60,6 +60,7 @@ README = '../README.md'
 # Comments around the tables of the README that this program writes.
 SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
 SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
+SUBSTEPS = 10  # of a control step in benchmarks/vector_environment.py
 MACHINE = (  # that of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
@@ -623,13 +624,13 @@ def speed() -> str:
     """Returns the table of the README with the rates of some environments."""
     found, cells = speeds(), []
     for id, alone in found['single'].items():
-        own, raw = found['ours'][id], found['engine alone'][id]
+        own, raw = found['ours'][id], alone['mj_step'] / SUBSTEPS
         one, two = (f'256 simulations, {threads} threads' for threads in (1, 2))
         cells.append((
-            f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / alone["raw mj_step"]:.2f})',
-            *(f'{own[n]["control steps per second"]} ({own[n]["control steps per second"] / raw[n]:.2f})'
+            f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / raw:.2f})',
+            *(f'{own[n]["control steps per second"]} ({own[n]["ratio to the engine"]:.2f})'
               for n in (one, two)),
-            f'{own[one]["reset, ms per simulation"]:.2f} ms',
+            f'{own[one]["reset"]:.2f} ms',
             f'{found["memory per simulation, kB"][id]} kB',
         ))  # fmt: skip
     header = (
@@ -650,17 +651,15 @@ def speed_page() -> str:
     cells = [
         (
             f'`{id}`', setting, own['control steps per second'],
-            f'{own["control steps per second"] / found["engine alone"][id][setting]:.2f}',
-            f'{own["serial, us per simulation"]:.2f}', f'{own["reset, ms per simulation"]:.2f}',
-            f'{own["share of resets"]:.2f}',
+            *(f'{own[name]:.2f}' for name in ('ratio to the engine', 'serial', 'reset', 'resets')),
         )
         for id, settings in found['ours'].items()
         for setting, own in settings.items()
     ]  # fmt: skip
     single = [
         (
-            f'`{id}`', own['single environment'], own['raw mj_step'],
-            f'{own["single environment"] / own["raw mj_step"]:.2f}', found['memory per simulation, kB'][id],
+            f'`{id}`', own['single environment'], own['mj_step'] // SUBSTEPS,
+            f'{own["single environment"] / own["mj_step"] * SUBSTEPS:.2f}', found['memory per simulation, kB'][id],
         )
         for id, own in found['single'].items()
     ]  # fmt: skip

@@ -209,9 +209,9 @@ class BenchTest(CommandTest):
         """Also for a gait, whose steps differ in duration."""
         self.enterContext(mock.patch.object(bench, 'WARM', 0.1))
         found = bench.vector('FSM_Hopper2D_Terrain_Gaps-v0', 2, 1, 0.05)
-        self.assertGreater(found['physics'], 50 * found['control'])
+        self.assertGreater(found['physics'], 50 * found['control steps per second'])
         found = bench.vector('PD_Dog2D_Flat-v0', 2, 1, 0.05)
-        self.assertAlmostEqual(found['physics'] / found['control'], 10, delta=2)
+        self.assertAlmostEqual(found['physics'] / found['control steps per second'], 10, delta=2)
 
     def test_invalid_arguments_are_rejected(self):
         self.assert_refused("did you mean 'PD_Dog2D_Gaps", 'bench', 'PD_Dog_Gaps_Terrain-v0')

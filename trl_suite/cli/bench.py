@@ -85,22 +85,24 @@ def physics_steps(environments: VectorEnvironment) -> int:
     return int(environments.task.world.engine.steps.sum())
 
 
-def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
+def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> dict[str, Any]:
     """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
     Args:
       id: id of the environment.
       num_envs: number of simulations.
-      threads: number of threads; 0 for all cores.
+      threads: number of threads.
       seconds: duration for the environment, and the same for the raw batch.
 
     Returns:
-      'control' and 'physics': steps per second of all simulations; 'engine': physics steps per
-      second of MuJoCo alone with terrain, never reset; 'serial': us per simulation and control
-      step in which only one thread works; 'resets': fraction of the threads' time spent in resets;
-      'reset': ms per simulation.
+      'control steps per second' of all simulations, resets included; 'physics' and 'engine':
+      physics steps per second of the environment, and of MuJoCo alone with terrain, never reset;
+      'ratio to the engine', of these two; 'serial': us per simulation and control step in which
+      only one thread works; 'reset': ms per simulation; 'resets': fraction of the threads' time
+      spent in resets; 'projection': control steps per second on each number of `PROJECTED` cores
+      as a multiple of those on one, by Amdahl's law from the serial part. Shared caches and memory
+      are neglected.
     """
-    threads = threads or machine.cores()
     environments, drawn = warmed(id, num_envs, threads)
     others, _ = warmed(id, num_envs, threads)
     world: Any = others.task.world
@@ -121,36 +123,23 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     for _ in range(ROUNDS):
         for turn in (control, alone):
             rate(turn, seconds / ROUNDS)
-    physics = physics_steps(environments) - before
+    physics = (physics_steps(environments) - before) / control.seconds
+    engine = alone.items / alone.seconds
     environments.close()
     others.close()
+    serial, shared = control.seconds - parallel.seconds, threads * parallel.seconds
     return {
-        'control': control.items / control.seconds,
-        'physics': physics / control.seconds,
-        'engine': alone.items / alone.seconds,
-        'serial': 1e6 * (control.seconds - parallel.seconds) / control.items,
-        'reset': 1e3 * begin.seconds / max(1, begin.items),
-        'resets': begin.seconds / (threads * control.seconds),
-    }
-
-
-def projection(found: dict[str, float], threads: int) -> dict[str, float]:
-    """Returns the projected speed-up by more cores over one core, by Amdahl's law.
-
-    Args:
-      found: result of `vector`.
-      threads: number of threads of that measurement.
-
-    Returns:
-      Number of cores -> ratio of control steps per second to those of one core. It includes the
-      limit by work of a single thread, not that by shared caches and memory.
-    """
-    total = 1e6 / found['control']  # us per simulation and control step
-    serial = found['serial']
-    parallel = threads * (total - serial)
-    return {
-        str(cores): round((serial + parallel) / (serial + parallel / cores), 1)
-        for cores in PROJECTED
+        'control steps per second': round(control.items / control.seconds),
+        'physics': round(physics),
+        'engine': round(engine),
+        'ratio to the engine': round(physics / engine, 3),
+        'serial': round(1e6 * serial / control.items, 3),
+        'reset': round(1e3 * begin.seconds / max(1, begin.items), 3),
+        'resets': round(begin.seconds / (threads * control.seconds), 3),
+        'projection': {
+            str(cores): round((serial + shared) / (serial + shared / cores), 1)
+            for cores in PROJECTED
+        },
     }
 
 
@@ -205,11 +194,12 @@ def raw(
     return rate(step, seconds)
 
 
-def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
+def single(id: str, seconds: float = SECONDS) -> dict[str, int]:
     """Measures raw `mj_step` from the initial state of an environment, and the environment itself.
 
     Returns:
-      'mj_step': physics steps per second; 'environment': control steps per second, resets included.
+      'mj_step': physics steps per second; 'single environment': control steps per second, resets
+      included.
     """
     environment = suite.make(id, {'random': 0})
     environment.reset()
@@ -217,11 +207,11 @@ def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
     state = physics.get_state(sig=mujoco.mjtState.mjSTATE_INTEGRATION)
     model = physics.model.ptr
     limp = not acts_directly(environment, model)
-    found = {'mj_step': substeps * raw(model, substeps, seconds, state, limp)}
+    alone = substeps * raw(model, substeps, seconds, state, limp)
     drawn = actions(-1, 1, environment.action_spec().shape)
-    found['environment'] = rate(lambda: environment.step(next(drawn)), seconds)
+    steps = rate(lambda: environment.step(next(drawn)), seconds)
     environment.close()
-    return found
+    return {'mj_step': round(alone), 'single environment': round(steps)}
 
 
 def bench(
@@ -236,12 +226,8 @@ def bench(
       seconds: duration of each of four measurements.
 
     Returns:
-      A dict that can be written as JSON: 'machine', 'id', 'num_envs', 'threads'; 'control steps per
-      second' of all simulations, and those of a 'single environment'; ratios of physics steps per
-      second, 'ratio to the engine' (MuJoCo alone on the same number of threads) and 'ratio to
-      mj_step' (on one thread); 'serial' (us per simulation and control step); 'reset' (ms per
-      simulation); and 'projection': the speed-up by 16 and 64 cores, by Amdahl's law from the work
-      of a single thread.
+      A dict that can be written as JSON: 'machine', 'id', 'num_envs', 'threads', the results of
+      `vector` and of `single`, and the 'ratio to mj_step' of their physics steps per second.
 
     Raises:
       ValueError: unknown id, or numbers out of range.
@@ -250,15 +236,9 @@ def bench(
         raise ValueError(f'seconds is {seconds}; expected a positive number')
     id, threads = suite.find(id).id, threads or machine.cores()
     many, one = vector(id, num_envs, threads, seconds), single(id, seconds)
-    return {
-        'machine': machine.sentence(), 'id': id, 'num_envs': num_envs, 'threads': threads,
-        'control steps per second': round(many['control']),
-        'ratio to the engine': round(many['physics'] / many['engine'], 3),
-        'ratio to mj_step': round(many['physics'] / one['mj_step'], 3),
-        'serial': round(many['serial'], 3), 'reset': round(many['reset'], 3),
-        'projection': projection(many, threads),
-        'single environment': round(one['environment']),
-    }  # fmt: skip
+    setting = {'id': id, 'num_envs': num_envs, 'threads': threads}
+    ratio = round(many['physics'] / one['mj_step'], 3)
+    return {'machine': machine.sentence(), **setting, **many, **one, 'ratio to mj_step': ratio}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -268,21 +248,14 @@ def run(arguments: argparse.Namespace) -> None:
     result = bench(arguments.id, arguments.num_envs, arguments.threads, arguments.seconds)
     if arguments.json is not None:
         files.write_json(result, arguments.json)
-    print(
-        f'{result["id"]}, {result["num_envs"]} simulations, {result["threads"]} threads, random actions'
-    )
-    print(f'  on {result["machine"]}')
-    for name, text in (
-        ('control steps', f'{result["control steps per second"]} per second, resets included'),
-        ('physics', f'{result["ratio to the engine"]:.2f} of the rate of MuJoCo alone on these threads'),
-        ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
-        ('serial', f'{result["serial"]:.2f} us per simulation and control step in one thread'),
-        ('reset', f'{result["reset"]:.2f} ms per simulation'),
-        (
-            'projected',
-            ', '.join(f'{v:.3g} times on {k} cores' for k, v in result['projection'].items())
-            + " of one core's rate, by Amdahl's law",
-        ),
-        ('alone', f'{result["single environment"]} control steps per second in a single environment'),
-    ):  # fmt: skip
-        print(f'  {name:<14} {text}')
+    projected = ', '.join(f'{v:.3g} times on {k} cores' for k, v in result['projection'].items())
+    text = """{id}, {num_envs} simulations, {threads} threads, random actions
+  on {machine}
+  control steps  {control steps per second} per second, resets included
+  physics        {ratio to the engine:.2f} of the rate of MuJoCo alone on these threads
+                 {ratio to mj_step:.2f} of the rate of raw mj_step on one thread
+  serial         {serial:.2f} us per simulation and control step in one thread
+  reset          {reset:.2f} ms per simulation
+  projected      {projected} of one core's rate, by Amdahl's law
+  alone          {single environment} control steps per second in a single environment"""
+    print(text.format_map({**result, 'projected': projected}))
