@@ -12,15 +12,18 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 
-from trl_suite import suite
-from trl_suite.cli import machine
-from trl_suite.environments.vector import VectorEnvironment
+from trl_suite.cli import engine, machine
+from trl_suite.cli.arguments import add_command, add_file, add_id, add_threads, positive
 from trl_suite.util import files
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from trl_suite.environments.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 NUM_ENVS = 64
@@ -72,7 +75,8 @@ def actions(low: Any, high: Any, shape: tuple[int, ...]) -> Iterator[np.ndarray]
 
 def warmed(id: str, num_envs: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
     """Makes a vector environment, runs it beyond most first episodes, and makes random actions."""
-    environments = VectorEnvironment(id, num_envs, threads, seed=0)
+    kind = engine.load('trl_suite.vector').VectorEnvironment
+    environments = kind(id, num_envs, threads, seed=0)
     environments.reset()
     drawn = actions(-1, 1, (num_envs, len(environments.action_map)))
     while physics_steps(environments) * environments.task.physics_timestep < WARM * num_envs:
@@ -124,15 +128,15 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
         for turn in (control, alone):
             rate(turn, seconds / ROUNDS)
     physics = (physics_steps(environments) - before) / control.seconds
-    engine = alone.items / alone.seconds
+    unhindered = alone.items / alone.seconds
     environments.close()
     others.close()
     serial, shared = control.seconds - parallel.seconds, threads * parallel.seconds
     return {
         'control steps per second': round(control.items / control.seconds),
         'physics': round(physics),
-        'engine': round(engine),
-        'ratio to the engine': round(physics / engine, 3),
+        'engine': round(unhindered),
+        'ratio to the engine': round(physics / unhindered, 3),
         'serial': round(1e6 * serial / control.items, 3),
         'reset': round(1e3 * begin.seconds / max(1, begin.items), 3),
         'resets': round(begin.seconds / (threads * control.seconds), 3),
@@ -174,6 +178,8 @@ def raw(
     Returns:
       Controls per second, with `substeps` physics steps each.
     """
+    import mujoco
+
     data = mujoco.MjData(model)
     low, high = model.actuator_ctrlrange.T.copy()
     free = ~model.actuator_ctrllimited.astype(bool)
@@ -201,7 +207,9 @@ def single(id: str, seconds: float = SECONDS) -> dict[str, int]:
       'mj_step': physics steps per second; 'single environment': control steps per second, resets
       included.
     """
-    environment = suite.make(id, {'random': 0})
+    environment = engine.load().make(id, {'random': 0})
+    import mujoco
+
     environment.reset()
     physics, substeps = environment.physics, control_substeps(environment)
     state = physics.get_state(sig=mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -234,17 +242,30 @@ def bench(
     """
     if not 0 < seconds < float('inf'):
         raise ValueError(f'seconds is {seconds}; expected a positive number')
-    id, threads = suite.find(id).id, threads or machine.cores()
+    id, threads = engine.load().find(id).id, threads or machine.cores()
     many, one = vector(id, num_envs, threads, seconds), single(id, seconds)
     setting = {'id': id, 'num_envs': num_envs, 'threads': threads}
     ratio = round(many['physics'] / one['mj_step'], 3)
     return {'machine': machine.sentence(), **setting, **many, **one, 'ratio to mj_step': ratio}
 
 
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = 'measure the speed of this machine against raw MuJoCo'
+    command = add_command(commands, 'bench', text, run)
+    add_id(command, nargs='?', default=ID)
+    command.add_argument(
+        '--num-envs', type=positive, default=NUM_ENVS, help='simulations of the vector environment'
+    )
+    add_threads(command)
+    command.add_argument(
+        '--seconds', type=float, default=SECONDS, help='duration of each of four measurements'
+    )
+    add_file(command, '--json', 'write all results, .json', '.json')
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and prints the results."""
-    if arguments.json is not None:
-        files.check_path(arguments.json, ('.json',))
     result = bench(arguments.id, arguments.num_envs, arguments.threads, arguments.seconds)
     if arguments.json is not None:
         files.write_json(result, arguments.json)

@@ -4,20 +4,38 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+from typing import Any
 
 from trl_suite import rendering
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import add_command, add_file
 from trl_suite.util import files, program
+
+
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = 'retarget a motion file to a character, and check it'
+    command = add_command(commands, 'clip', text, run)
+    text = 'BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; recognised from the content'
+    command.add_argument('file', metavar='FILE', type=pathlib.Path, help=text)
+    command.add_argument('--character', required=True, help='name of a character')
+    add_file(command, '--skeleton', 'the .asf file of an .amc file')
+    text = (
+        "a .json that maps the character's joints to the motion's; by default usual names are tried"
+    )
+    add_file(command, '--map', text)
+    command.add_argument(
+        '--scale', type=float, help='scale of lengths; by default the ratio of limb lengths'
+    )
+    text = 'cut one cycle, between two times (s), or without times the best cycle that is found'
+    command.add_argument('--cycle', nargs='*', type=float, metavar='TIME', help=text)
+    command.add_argument('--frames', action='store_true', help='print the faults of every frame')
+    add_file(command, '--output', 'write the clip, .npz', '.npz')
+    add_file(command, '--strip', 'write a film strip, .png', *rendering.IMAGE_SUFFIXES)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Retargets a motion file to a character, and prints the faults of the clip."""
-    for path, suffixes in (
-        (arguments.output, ('.npz',)),
-        (arguments.strip, rendering.IMAGE_SUFFIXES),
-    ):
-        if path is not None:
-            files.check_path(path, suffixes)
     if arguments.cycle and len(arguments.cycle) != 2:
         raise ValueError(f'--cycle: {len(arguments.cycle)} times; expected none or two')
     engine.load()

@@ -19,9 +19,11 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from trl_suite import policies
 from trl_suite.cli import machine
+from trl_suite.cli.arguments import add_command
 from trl_suite.util import compiled, libraries, resources
 
 BACKENDS = ('egl', 'osmesa', 'glfw')
@@ -96,6 +98,11 @@ class Finding:
     state: str
     text: str
     remedy: str = ''
+
+
+def declare(commands: Any) -> None:
+    """Declares the command."""
+    add_command(commands, 'doctor', 'check the installation; print problems and remedies', run)
 
 
 def findings() -> Iterator[Finding]:

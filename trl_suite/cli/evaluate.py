@@ -3,16 +3,41 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import (
+    add_command,
+    add_file,
+    add_id,
+    add_options,
+    add_policy,
+    add_threads,
+    positive,
+)
 from trl_suite.environments import named_policies as acting
 from trl_suite.util import files
 
 
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = 'run a policy for whole episodes, and print a summary'
+    command = add_command(commands, 'evaluate', text, run)
+    add_id(command)
+    add_policy(command, 'reference')
+    add_options(command)
+    command.add_argument('--episodes', type=positive, default=50, help='number of episodes')
+    command.add_argument(
+        '--seed', type=int, default=0, help='seed of the environments and the policy'
+    )
+    add_threads(command)
+    text = "steps after which an episode is truncated, instead of the environment's limit"
+    command.add_argument('--step-limit', type=positive, metavar='N', help=text)
+    add_file(command, '--json', 'write all results, .json', '.json')
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Runs a policy for whole episodes, and prints a summary."""
-    if arguments.json is not None:
-        files.check_path(arguments.json, ('.json',))
     spec = engine.load().find(arguments.id)
     from trl_suite import evaluation
 

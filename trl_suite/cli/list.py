@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from trl_suite import policies
+from trl_suite.cli.arguments import add_command
 from trl_suite.registry import catalogue
 from trl_suite.util import errors, tables
 
 FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
+
+
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    command = add_command(commands, 'list', 'list the environments of the catalogue', run)
+    for name in FILTERS:
+        command.add_argument(f'--{name}', help=f'only environments of this {name}')
+    command.add_argument(
+        '--trained', action='store_true', help='only environments with a shipped policy'
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,15 @@ import numpy as np
 
 from trl_suite import rendering
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import (
+    add_command,
+    add_file,
+    add_id,
+    add_options,
+    add_policy,
+    positive,
+    valid,
+)
 from trl_suite.environments import named_policies as acting
 from trl_suite.util import files, tables
 
@@ -23,16 +33,36 @@ SHOWN_EPISODES = 8  # largest number of episodes that are printed
 _ENDS = ('fell', 'stuck', 'diverged')  # causes of an end of episode, in a task's info
 
 
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    command = add_command(commands, 'rollout', 'run a policy for a number of steps', run)
+    add_id(command)
+    command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
+    command.add_argument('--steps', type=positive, default=256, help='number of control steps')
+    add_policy(command, 'random')
+    add_options(command)
+    add_file(command, '--video', 'write a video, .mp4 or .gif', *rendering.VIDEO_SUFFIXES)
+    add_file(command, '--html', 'write an interactive replay, .html', *rendering.REPLAY_SUFFIXES)
+    add_file(command, '--strip', 'write a film strip, .png', *rendering.IMAGE_SUFFIXES)
+    command.add_argument('--columns', type=positive, default=8, help='pictures in the strip')
+    add_file(command, '--trajectory', 'write all time steps, .npz', '.npz')
+    command.add_argument('--ghost', action='store_true', help='show the reference clip as well')
+    command.add_argument(
+        '--size', type=_size, default='640x480', metavar='WxH', help='size of pictures in pixels'
+    )
+    command.add_argument('--camera', default='side', help='name of a camera')
+
+
+@valid
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r'(\d+)x(\d+)', text)
+    if not match:
+        raise ValueError(f'{text!r} is not a size such as 640x480')
+    return int(match[1]), int(match[2])
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Runs a policy, writes the requested files, and prints a line per episode and per file."""
-    for path, suffixes in (
-        (arguments.video, rendering.VIDEO_SUFFIXES),
-        (arguments.html, rendering.REPLAY_SUFFIXES),
-        (arguments.strip, rendering.IMAGE_SUFFIXES),
-        (arguments.trajectory, ('.npz',)),
-    ):
-        if path is not None:  # checked before the rollout
-            files.check_path(path, suffixes)
     suite = engine.load()
     options = dict(arguments.options or ())
     environment = suite.make(arguments.id, {**options, 'random': arguments.seed})

@@ -5,16 +5,43 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import pathlib
 import sys
 from typing import Any
 
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import add_command, add_threads, positive
 from trl_suite.util import errors, program
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Runs the action: list, run or check."""
-    {'list': _list, 'run': _run, 'check': _check}[arguments.action](arguments)
+def declare(commands: Any) -> None:
+    """Declares the command, its actions, and their arguments."""
+    command = add_command(commands, 'sequences', 'benchmark of continual learning')
+    actions = command.add_subparsers(required=True, metavar='action')
+    add_command(actions, 'list', 'list the sequences', _list)
+    text = 'train a learner on a sequence, and test it after each stage'
+    command = add_command(actions, 'run', text, _run)
+    command.add_argument('name', metavar='NAME', help='name of a sequence')
+    text = 'class of the learner: CLASS(sequence, seed), with the methods train(stage) and policy()'
+    command.add_argument('--learner', required=True, metavar='MODULE:CLASS', help=text)
+    command.add_argument('--budget', default='small', help='samples per stage: small, full, or N')
+    command.add_argument(
+        '--episodes', type=positive, default=32, help='episodes per test and environment'
+    )
+    command.add_argument('--stages', type=positive, metavar='N', help='stop after N stages')
+    command.add_argument('--seed', type=int, default=0, help='seed of the run')
+    add_threads(command)
+    command.add_argument(
+        '--output',
+        type=pathlib.Path,
+        default='result.json',
+        metavar='FILE',
+        help='result, .json; an unfinished run is resumed',
+    )
+    command = add_command(actions, 'check', 'check results: fields, budget and metrics', _check)
+    command.add_argument(
+        'files', nargs='+', type=pathlib.Path, metavar='FILE', help='a result, .json'
+    )
 
 
 def _list(arguments: argparse.Namespace) -> None:

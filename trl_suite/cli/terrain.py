@@ -4,15 +4,36 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+from typing import Any
 
 import numpy as np
 
 from trl_suite import rendering, terrain
+from trl_suite.cli.arguments import add_command, add_file, positive
 from trl_suite.terrain.mesh import LARGEST_SIDE
 from trl_suite.util import files
 
 BEFORE = 2.0  # m; extent of planar ground behind the start
 LONGEST = LARGEST_SIDE - BEFORE  # m
+
+
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = 'plot random grounds of a terrain, or write one as a mesh'
+    command = add_command(commands, 'terrain', text, run)
+    command.add_argument(
+        'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
+    )
+    command.add_argument('--draws', type=positive, default=3, help='number of grounds')
+    command.add_argument(
+        '--length', type=float, default=40.0, help='length of a profile, or side of a map, in m'
+    )
+    command.add_argument('--seed', type=int, default=0, help='seed of the grounds')
+    command.add_argument(
+        '--terrain-level', type=float, default=0.0, help='index of the parameter set'
+    )
+    text = 'write a plot, .png, or a mesh of the first ground, .obj, .glb or .stl'
+    add_file(command, '--output', text)
 
 
 def run(arguments: argparse.Namespace) -> None:

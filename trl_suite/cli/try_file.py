@@ -11,6 +11,7 @@ import numpy as np
 
 from trl_suite import rendering
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import add_command, add_file
 from trl_suite.util import files, program, tables
 
 if TYPE_CHECKING:
@@ -22,6 +23,31 @@ SECONDS = 1.0  # duration of zero actions before a picture is rendered
 _ARGUMENTS = re.compile(
     r'\b(root|spatial|turn|end_effectors|fall_links|balance_inertia)=(True|False)?'
 )
+
+
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = 'read a character from a file, print its properties, and render it'
+    command = add_command(commands, 'try', text, run)
+    command.add_argument('file', metavar='FILE', type=pathlib.Path, help='an .xml, .mjcf or .urdf')
+    command.add_argument(
+        '--root', metavar='BODY', help='root of the character, parent of all other links'
+    )
+    command.add_argument(
+        '--end-effectors', nargs='+', metavar='BODY', help='by default the last body of each limb'
+    )
+    text = (
+        'links that must not touch the ground; without names there are none; by default the first '
+        'that can touch it'
+    )
+    command.add_argument('--fall-links', nargs='*', metavar='BODY', help=text)
+    text = "whether the character is three-dimensional; by default derived from the root's joints"
+    command.add_argument('--spatial', action=argparse.BooleanOptionalAction, help=text)
+    text = 'quaternion that rotates the character so that it faces +x, with z up'
+    command.add_argument('--turn', nargs=4, type=float, metavar=tuple('WXYZ'), help=text)
+    text = 'replace moments of inertia that no body has by their mean'
+    command.add_argument('--balance-inertia', action='store_true', help=text)
+    add_file(command, '--output', 'file of the picture on three terrains, .png')
 
 
 def run(arguments: argparse.Namespace) -> None:

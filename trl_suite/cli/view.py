@@ -14,13 +14,41 @@ from typing import TYPE_CHECKING, Any
 
 from trl_suite import rendering
 from trl_suite.cli import engine
+from trl_suite.cli.arguments import add_command, add_id, add_options, positive, valid
 from trl_suite.environments import named_policies as acting
-from trl_suite.viewing.playback import Playback
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
 INSTEAD = 'use --browser to show it in a web browser, on this or another machine'
+
+
+def declare(commands: Any) -> None:
+    """Declares the command and its arguments."""
+    text = "show an environment with a policy, in dm_control's viewer or in a web browser"
+    command = add_command(commands, 'view', text, run)
+    add_id(command)
+    policies = ', '.join(acting.POLICIES)
+    command.add_argument(
+        '--policy',
+        default='best',
+        type=_policy,
+        metavar='POLICY',
+        help=f'{policies}, or an .npz file; best: the first of these that exists',
+    )
+    command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
+    add_options(command)
+    text = "show it in web browsers, with controls, instead of dm_control's viewer (F1: its keys)"
+    command.add_argument('--browser', action='store_true', help=text)
+    command.add_argument('--host', default='127.0.0.1', help='address to listen on with --browser')
+    command.add_argument(
+        '--port', type=positive, default=8080, help='first port to try with --browser'
+    )
+
+
+@valid
+def _policy(text: str) -> str:
+    return text if text == 'best' else acting.check(text)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -93,6 +121,8 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     """
     shown: Any = environment
     if hasattr(environment.task, 'watch'):
+        from trl_suite.viewing.playback import Playback
+
         shown = Playback(environment, policy)
         policy = shown.policy
     engine.load('trl_suite.viewing.window').Window(environment, title).launch(shown, policy)
