@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -27,7 +28,6 @@ from trl_suite.util.compiled import Compiled, compiled
 
 _FULL = (1 << 64) - 1
 _MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
-_HIGH, _LOW = _MULTIPLIER >> 64, _MULTIPLIER & _FULL
 _TAIL, _INVERSE_TAIL = 3.6541528853610087963519472518, 0.27366123732975827203338247596
 _DOUBLE = 1.0 / 9007199254740992.0
 
@@ -45,35 +45,45 @@ class Streams:
 
     def seed(self, env_id: int, sequence: np.random.SeedSequence) -> None:
         """Seeds a stream as `np.random.default_rng(sequence)` would be."""
-        self._store(env_id, np.random.PCG64(sequence))
+        _store(np.random.PCG64(sequence), self.state[env_id])
 
-    @contextlib.contextmanager
-    def generator(self, env_id: int) -> Iterator[np.random.Generator]:
-        """Yields a Generator that continues a stream; on exit the stream takes over its state."""
-        bits = np.random.PCG64(0)
-        high, low, inc_high, inc_low, has_uint32, uinteger = self.state[env_id].tolist()
-        bits.state = {
-            'bit_generator': 'PCG64',
-            'state': {'state': high << 64 | low, 'inc': inc_high << 64 | inc_low},
-            'has_uint32': has_uint32,
-            'uinteger': uinteger,
-        }
-        yield np.random.Generator(bits)
-        self._store(env_id, bits)
-
-    def _store(self, env_id: int, bits: np.random.PCG64) -> None:
-        found: Any = bits.state
-        state, inc = found['state']['state'], found['state']['inc']
-        self.state[env_id] = (
-            state >> 64, state & _FULL, inc >> 64, inc & _FULL, found['has_uint32'],
-            found['uinteger'],
-        )  # fmt: skip
+    def generator(self, env_id: int) -> contextlib.AbstractContextManager[np.random.Generator]:
+        """Returns a context with a Generator that continues a stream, which follows at the exit."""
+        return _continued(self.state[env_id])
 
 
-def _next_native() -> Callable[..., Any]:
+@contextlib.contextmanager
+def _continued(words: np.ndarray) -> Iterator[np.random.Generator]:
+    """Yields a Generator that continues a stream; on exit its state is stored."""
+    bits = np.random.PCG64(0)
+    high, low, inc_high, inc_low, has_uint32, uinteger = words.tolist()
+    bits.state = {
+        'bit_generator': 'PCG64',
+        'state': {'state': high << 64 | low, 'inc': inc_high << 64 | inc_low},
+        'has_uint32': has_uint32,
+        'uinteger': uinteger,
+    }
+    yield np.random.Generator(bits)
+    _store(bits, words)
+
+
+def _store(bits: np.random.PCG64, words: np.ndarray) -> None:
+    found: Any = bits.state
+    state, inc = found['state']['state'], found['state']['inc']
+    words[:4] = state >> 64, state & _FULL, inc >> 64, inc & _FULL
+    words[4:] = found['has_uint32'], found['uinteger']
+
+
+# Compiled functions have their own PCG64 and ziggurat: those of NumPy keep their states in memory of
+# their own, while tasks save, restore and copy the states of all simulations as an array.
+
+
+@functools.cache
+def _next64() -> Callable[..., Any]:
+    """Returns a compiled function that returns the next 64 bits of stream i."""
     from numba import njit, uint64
 
-    high, low = np.uint64(_HIGH), np.uint64(_LOW)
+    high, low = np.uint64(_MULTIPLIER >> 64), np.uint64(_MULTIPLIER & _FULL)
     half, mask = np.uint64(32), np.uint64(0xFFFFFFFF)
     one, zero, turn, bits = np.uint64(1), np.uint64(0), np.uint64(58), np.uint64(64)
 
@@ -85,6 +95,7 @@ def _next_native() -> Callable[..., Any]:
         other = a0 * b1 + (middle & mask)
         return a1 * b1 + (middle >> half) + (other >> half)
 
+    @njit(error_model='numpy')
     def next64(i: int, state: np.ndarray) -> Any:
         s1, s0 = state[i, 0], state[i, 1]
         lower = s0 * low
@@ -101,30 +112,19 @@ def _next_native() -> Callable[..., Any]:
     return next64
 
 
-def _next(i: int, state: np.ndarray) -> int:
-    """Returns the next 64 bits of stream i."""
-    high, low, inc_high, inc_low = (int(word) for word in state[i, :4])
-    whole = ((high << 64 | low) * _MULTIPLIER + (inc_high << 64 | inc_low)) & ((1 << 128) - 1)
-    state[i, 0], state[i, 1] = whole >> 64, whole & _FULL
-    mixed, by = (whole >> 64) ^ (whole & _FULL), whole >> 122
-    return (mixed >> by | mixed << (64 - by)) & _FULL
-
-
-_next64 = Compiled(_next, _next_native)
-
-
 def _random_native() -> Callable[..., Any]:
-    shift = np.uint64(11)
+    next64, shift = _next64(), np.uint64(11)
 
     def random(i: int, state: np.ndarray) -> float:
-        return (_next64(i, state) >> shift) * _DOUBLE
+        return (next64(i, state) >> shift) * _DOUBLE
 
     return random
 
 
 def _random(i: int, state: np.ndarray) -> float:
     """Draws from [0, 1), as `Generator.random()`."""
-    return (_next64(i, state) >> 11) * _DOUBLE
+    with _continued(state[i]) as generator:
+        return generator.random()
 
 
 random = Compiled(_random, _random_native)
@@ -191,47 +191,19 @@ def _draw(bits: int) -> float:
 draw = Compiled(_draw, _draw_native)
 
 
-def _words_native() -> Callable[..., Any]:
-    eight, one, byte = np.uint64(8), np.uint64(1), np.uint64(0xFF)
-    mantissa = np.uint64(0x000FFFFFFFFFFFFF)
-
-    def words(i: int, state: np.ndarray) -> tuple[int, bool, int]:
-        bits = _next64(i, state)
-        rest = bits >> eight
-        return int(bits & byte), (rest & one) != np.uint64(0), int((rest >> one) & mantissa)
-
-    return words
-
-
-def _words(i: int, state: np.ndarray) -> tuple[int, bool, int]:
-    """Draws the layer of the ziggurat, a sign, and 52 bits."""
-    bits = _next64(i, state)
-    rest = bits >> 8
-    return bits & 0xFF, bool(rest & 1), rest >> 1 & 0x000FFFFFFFFFFFFF
-
-
-_draw_words = Compiled(_words, _words_native)
-
-
-def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normal_native() -> Callable[..., Any]:
     from numba.np.random import _constants
 
-    return (
-        _constants.ki_double.astype(np.int64), _constants.wi_double, _constants.fi_double,
-    )  # fmt: skip
+    limits = _constants.ki_double.astype(np.int64)
+    widths, heights, next64 = _constants.wi_double, _constants.fi_double, _next64()
+    byte, sign, nine, mantissa = map(np.uint64, (0xFF, 0x100, 9, 0x000FFFFFFFFFFFFF))
 
-
-def _normal_native() -> Callable[..., Any]:
-    limits, widths, heights = _tables()
-    return _ziggurat(limits, widths, heights)
-
-
-def _ziggurat(limits: np.ndarray, widths: np.ndarray, heights: np.ndarray) -> Callable[..., Any]:
     def normal(i: int, state: np.ndarray) -> float:
         while True:
-            layer, negative, size = _draw_words(i, state)
+            bits = next64(i, state)
+            layer, size = int(bits & byte), int((bits >> nine) & mantissa)
             x = size * widths[layer]
-            if negative:
+            if bits & sign:
                 x = -x
             if size < limits[layer]:
                 return x
@@ -251,7 +223,8 @@ def _ziggurat(limits: np.ndarray, widths: np.ndarray, heights: np.ndarray) -> Ca
 
 def _normal(i: int, state: np.ndarray) -> float:
     """Draws from the standard normal distribution, as `Generator.standard_normal()`."""
-    return _ziggurat(*_tables())(i, state)
+    with _continued(state[i]) as generator:
+        return generator.standard_normal()
 
 
 standard_normal = Compiled(_normal, _normal_native)
