@@ -642,42 +642,6 @@ class OwnArenaTest(parameterized.TestCase):
         self.assertAlmostEqual(np.mean(forces), weight, delta=0.02 * weight)
         self.assertGreater(heights(model, data)[0], -0.01)
 
-    @parameterized.parameters(*NAMES)
-    def test_observables(self, name):
-        arena = users_arena()
-        character = characters.make(name)
-        character.create_root_joints(arena.attach(character))
-        character.observables.enable_all()
-        task = composer.NullTask(arena)
-        environment = composer.Environment(
-            task, random_state=0, strip_singleton_obs_buffer_dim=True, time_limit=0.1
-        )
-        environment.reset()
-        physics = environment.physics
-        physics.named.data.qpos[f'{name}/root/'][2] = 2.0
-        turn = quaternion_of((0.1, -0.2, 0.3))
-        physics.named.data.qpos[f'{name}/right_hip'] = turn
-        physics.named.data.qpos[f'{name}/right_knee'] = -0.3
-        physics.named.data.qvel[f'{name}/right_hip'] = 0.5, 0.6, 0.7
-        physics.forward()
-        read = {
-            key.removeprefix(f'{name}/'): value.observation_callable(physics)()
-            for key, value in task.observables.items()
-        }
-        degrees, balls = int(character.dofs.sum()), int(character.spherical.sum())
-        self.assertEqual(
-            {key: np.shape(value) for key, value in read.items()},
-            {'joints_pos': (degrees + balls,), 'joints_vel': (degrees,), 'root_pos': (3,),
-             'root_mat': (9,), 'bodies_pos': (len(LINKS[name]), 3), 'end_effectors_pos': (2, 3)},
-        )  # fmt: skip
-        first = 4 if 'torso' in JOINTS[name] else 0  # in link order, whatever the tree's
-        np.testing.assert_allclose(read['joints_pos'][first : first + 5], (*turn, -0.3))
-        first = 3 if 'torso' in JOINTS[name] else 0
-        np.testing.assert_allclose(read['joints_vel'][first : first + 4], (0.5, 0.6, 0.7, 0))
-        np.testing.assert_allclose(read['root_pos'], (0, 0, 2), atol=1e-12)
-        com = LINKS[name]['root'][3]
-        np.testing.assert_allclose(read['bodies_pos'][0], to_mujoco(com), atol=1e-9)
-
     def test_two_characters_in_one_arena(self):
         arena = users_arena()
         for i in range(2):

@@ -512,44 +512,6 @@ class OwnArenaTest(parameterized.TestCase):
         height = physics.named.data.xpos['biped2d/root', 'z']
         self.assertAlmostEqual(height, FIGURES['biped2d'].height, delta=0.01)
 
-    @parameterized.parameters(*NAMES)
-    def test_observables(self, name):
-        arena = users_arena()
-        character = characters.make(name)
-        character.create_root_joints(arena.attach(character))
-        character.observables.enable_all()
-        task = composer.NullTask(arena)
-        environment = composer.Environment(
-            task, random_state=0, strip_singleton_obs_buffer_dim=True, time_limit=0.1
-        )
-        environment.reset()
-        physics = environment.physics
-        physics.named.data.qpos[f'{name}/root_z/'] = 2.0
-        joint = next(iter(JOINTS[name]))
-        physics.named.data.qpos[f'{name}/{joint}'] = 0.3
-        physics.named.data.qvel[f'{name}/{joint}'] = 0.7
-        physics.forward()
-        read = {
-            key.removeprefix(f'{name}/'): value.observation_callable(physics)()
-            for key, value in task.observables.items()
-        }
-        links, joints = len(JOINTS[name]) + 1, len(JOINTS[name])
-        effectors = len(FIGURES[name].effectors.split())
-        shapes = {
-            'joints_pos': (joints,), 'joints_vel': (joints,), 'root_pos': (3,), 'root_mat': (9,),
-            'bodies_pos': (links, 3), 'end_effectors_pos': (effectors, 3),
-        }  # fmt: skip
-        self.assertEqual({key: np.shape(value) for key, value in read.items()}, shapes)
-        for value in read.values():
-            self.assertTrue(np.isfinite(value).all())
-        self.assertEqual(read['joints_pos'][0], 0.3)
-        self.assertEqual(read['joints_vel'][0], 0.7)
-        self.assertAlmostEqual(read['root_pos'][2], 2.0, delta=1e-12)
-        com = LINKS[name]['root'][3]
-        np.testing.assert_allclose(read['bodies_pos'][0], to_mujoco(com), atol=1e-9)
-        effector = physics.named.data.xpos[f'{name}/{FIGURES[name].effectors.split()[0]}']
-        np.testing.assert_allclose(read['end_effectors_pos'][0], effector - read['root_pos'])
-
     def test_two_characters_in_one_arena(self):
         arena = users_arena()
         for i in range(2):

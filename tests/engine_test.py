@@ -212,16 +212,16 @@ class StateTest(parameterized.TestCase):
             world.qvel[0, 0] = speed
             world.step(SUBSTEPS)
             np.testing.assert_array_equal(world.diverged(), [True, False][: world.n])
-            self.assertTrue(world.any_diverged())
+            self.assertTrue(world.diverged().any())
             world.step(SUBSTEPS)  # MuJoCo has reset it; it remains marked as diverged
             self.assertTrue(world.diverged()[0])
             world.set_state(0, good)
-            self.assertFalse(world.any_diverged())
+            self.assertFalse(world.diverged().any())
             world.qvel[0, 0] = speed
             world.step(SUBSTEPS)
-            self.assertTrue(world.any_diverged())
+            self.assertTrue(world.diverged().any())
             world.reset(world.all_ids)
-            self.assertFalse(world.any_diverged())
+            self.assertFalse(world.diverged().any())
 
 
 class NamesTest(parameterized.TestCase):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
 from dm_control.suite.wrappers import action_noise, action_scale, mujoco_profiling, pixels
 from dm_env import test_utils
 from helpers import (
@@ -661,9 +662,16 @@ class ObservableTest(parameterized.TestCase):
     def build(self, **options):
         spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
         task = suite.build_task(spec)
-        observables = task.character.observables
-        for name in ('joints_pos', 'bodies_pos', 'root_pos'):
-            getattr(observables, name).enabled = True
+        character = task.character
+        for name, each in (
+            ('joints_pos', observable.MJCFFeature('qpos', character.joints)),
+            (
+                'bodies_pos',
+                observable.Generic(lambda physics: physics.bind(character.bodies).xipos),
+            ),
+            ('root_pos', observable.MJCFFeature('xpos', character.root_body)),
+        ):
+            character.observables.add_observable(name, each)
         return Environment(task, random=7, **options)
 
     def test_observables_are_current(self):

@@ -10,6 +10,7 @@ import textwrap
 
 import numpy as np
 from absl.testing import absltest, parameterized
+from dm_control.composer.observation import observable
 
 from trl_suite import motion, suite
 from trl_suite.arenas import PlanarArena
@@ -241,7 +242,8 @@ class SaveTest(parameterized.TestCase):
     def test_extra_observables_are_current_after_a_restore(self):
         def build():
             task = suite.build_task(suite.find(DOG))
-            task.character.observables.joints_pos.enabled = True
+            joints = observable.MJCFFeature('qpos', task.character.joints)
+            task.character.observables.add_observable('joints_pos', joints)
             return Environment(task, random=0)
 
         environment, other = build(), build()

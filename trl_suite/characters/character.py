@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from dm_control import composer, mjcf
-from dm_control.composer.observation import observable
 
 from trl_suite.util import errors, resources
 
@@ -127,7 +126,7 @@ class CharacterSpec:
 class Character(composer.Entity):
     """An articulated figure, planar or in three dimensions, that can be attached to any arena.
 
-    The entity owns its MJCF tree and its observables. Gains, limits and muscles become actuators
+    The entity owns its MJCF tree. Gains, limits and muscles become actuators
     only when an actuation model is added (see `trl_suite.actuation`).
     """
 
@@ -139,9 +138,6 @@ class Character(composer.Entity):
             self._mjcf_root = mjcf.from_path(str(resources.directory('xml') / f'{spec.name}.xml'))
         if name is not None:
             self._mjcf_root.model = name
-
-    def _build_observables(self) -> CharacterObservables:
-        return CharacterObservables(self)
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:
@@ -232,56 +228,6 @@ class Character(composer.Entity):
                 f'{name!r}'
             )
         return element
-
-
-class CharacterObservables(composer.Observables):
-    """Observables of a character, all of them disabled by default."""
-
-    @composer.observable
-    def joints_pos(self) -> observable.MJCFFeature:
-        """Joint angles in rad, lengths in m where prismatic, unit quaternions of ball joints.
-
-        Concatenated in the order of `joints`, shape (number of joints + 3 per ball joint,).
-        """
-        return observable.MJCFFeature('qpos', self._entity.joints)
-
-    @composer.observable
-    def joints_vel(self) -> observable.MJCFFeature:
-        """Joint velocities in rad/s, in m/s where prismatic; three per ball joint, link axes.
-
-        Concatenated in the order of `joints`, shape (number of joints + 2 per ball joint,).
-        """
-        return observable.MJCFFeature('qvel', self._entity.joints)
-
-    @composer.observable
-    def root_pos(self) -> observable.MJCFFeature:
-        """World position of the root, m, shape (3,)."""
-        return observable.MJCFFeature('xpos', self._entity.root_body)
-
-    @composer.observable
-    def root_mat(self) -> observable.MJCFFeature:
-        """Orientation of the root as a flat rotation matrix, shape (9,)."""
-        return observable.MJCFFeature('xmat', self._entity.root_body)
-
-    @composer.observable
-    def bodies_pos(self) -> observable.Generic:
-        """Link centres of mass relative to the root, world axes, m, shape (links, 3)."""
-
-        def relative(physics: mjcf.Physics) -> np.ndarray:
-            bodies = physics.bind(self._entity.bodies)
-            return np.asarray(bodies.xipos) - np.asarray(bodies.xpos)[0]
-
-        return observable.Generic(relative)
-
-    @composer.observable
-    def end_effectors_pos(self) -> observable.Generic:
-        """End effectors' joint positions relative to the root, world axes, m, (effectors, 3)."""
-
-        def relative(physics: mjcf.Physics) -> np.ndarray:
-            effectors = np.asarray(physics.bind(self._entity.end_effectors).xpos)
-            return effectors - np.asarray(physics.bind(self._entity.root_body).xpos)
-
-        return observable.Generic(relative)
 
 
 def fingerprint(spec: CharacterSpec) -> str:

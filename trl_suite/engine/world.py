@@ -163,11 +163,6 @@ class World:
             scratch = self._local.scratch = mujoco.MjData(self.models[0])
         mujoco.mj_setConst(self.models[env_id], scratch)
 
-    @property
-    def state_size(self) -> int:
-        """Size of the array that `get_state` returns."""
-        return int(mujoco.mj_stateSize(self.models[0], STATE))
-
     def get_state(self, env_id: int) -> np.ndarray:
         """Returns the full integration state of one simulation."""
         model = self.models[env_id]
@@ -183,10 +178,6 @@ class World:
         self.engine.time[env_id] = data.time
         mujoco.mj_forward(model, data)
         native.read_all(self.all_ids[[env_id]], self.pack)
-
-    def any_diverged(self) -> bool:
-        """Returns whether `diverged` is true for any simulation."""
-        return bool(self.diverged().any())
 
     def diverged(self) -> np.ndarray:
         """Returns which simulations have had a non-finite or huge state since their reset, (n,)."""

@@ -87,11 +87,6 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v + w * across + cross(axis, across)
 
 
-def reflect(q: np.ndarray) -> np.ndarray:
-    """Returns the mirror image in the x-z plane (left and right exchanged), shape (..., 4)."""
-    return q * np.array([1, -1, 1, -1])
-
-
 def about_z(angle: np.ndarray) -> np.ndarray:
     """Returns the rotation by an angle about the vertical, shape (...) -> (..., 4)."""
     half = np.asarray(angle) / 2
