@@ -391,10 +391,10 @@ class SensorTest(parameterized.TestCase):
         found, action = [], np.zeros((32, len(environments.action_map)))
         environments.reset()
         for _ in range(12):
-            step = environments.step(action, ~environments._simulations.ended)
+            step = environments.step(action, ~environments.core.ended)
             found.append(step.observation - step.info['clean_observation'])
         error = np.array(found)  # (steps, n, size)
-        going = ~environments._simulations.ended
+        going = ~environments.core.ended
         error = error[:, going]
         np.testing.assert_array_equal(error[..., blocks['phase']], 0)
         pose = error[..., blocks['pose']]

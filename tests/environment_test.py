@@ -195,7 +195,7 @@ def every_environment(id_):
                 self.kept[flat] = suite.make(id_, {'random': seed}, {'flat_observation': flat})
             environment = self.kept[flat]
             environment.random_state.seed(seed)
-            environment._step_limit = step_limit
+            environment.step_limit = step_limit
             return environment
 
         # Renamed so that it runs first: then the environment is fresh.

@@ -311,7 +311,7 @@ class Calls(stateful.RuleBasedStateMachine):
         found = [single.get_state() for single in self.singles]
         for i, j in pairs:
             self.singles[j].set_state(
-                states.seal({**found[i], 'random': self.singles[j].random_state.get_state()})
+                states.seal({**found[i], 'random': [self.singles[j].random_state.get_state()]})
             )
         self.environments.copy_from(self.environments, [i for i, _ in pairs], [j for _, j in pairs])
 

@@ -94,7 +94,7 @@ class IdentityTest(parameterized.TestCase):
                     )
                 if any(one.last() for one in steps):
                     for one in alone:
-                        one._reset_next_step = False
+                        one.core.ended[0] = False
         self.assertGreater(float(world.qpos[:, 0].min()), 9.0)
 
     @parameterized.parameters(*AUTORESET)
@@ -401,6 +401,7 @@ class PartialBatchTest(parameterized.TestCase):
             for each in environments, single:
                 with self.assertRaisesRegex(TypeError, 'a state is a dict from get_state, not '):
                     each.set_state(state)
+        self.assertEqual([*single.get_state()], [*environments.get_state()])
         partial = environments.get_state()
         del partial['ended']
         with self.assertRaisesRegex(ValueError, 'its checksum differs'):

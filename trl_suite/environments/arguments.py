@@ -1,9 +1,8 @@
-"""Checks of the arguments of environments: limits, simulations, seeds, threads."""
+"""Checks of the arguments of environments: limits, simulations, seeds, types."""
 
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,26 +10,7 @@ import numpy as np
 
 from trl_suite.util import errors
 
-TIME_ERROR = 1e-6  # s; more than the error of a sum of physics steps, less than one of them
-
-
-class OneThread:
-    """Rejects a second thread while a first one is inside; the same thread may enter again.
-
-    Two threads that step the same simulation would crash the process.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
-
-    def __enter__(self) -> None:
-        if not self._lock.acquire(blocking=False):
-            raise RuntimeError(
-                'another thread is using the environment; make one environment for each thread'
-            )
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
+Ids = np.ndarray | Sequence[int] | None  # indices of simulations, or a mask; None for all
 
 
 def absolute(value: Any) -> Any:
@@ -42,17 +22,22 @@ def absolute(value: Any) -> Any:
     return value
 
 
-def check_step_limit(value: Any) -> int | None:
+def check_step_limit(value: Any, name: str = 'step_limit', none: str = 'None') -> int | None:
     """Returns a limit of control steps; None for no limit.
+
+    Args:
+      value: the limit.
+      name: name of the argument.
+      none: what stands for no limit, for the message.
 
     Raises:
       ValueError: it is neither None nor a positive integer.
     """
-    if value is not None and not (
-        errors.is_number(value) and 1 <= value < np.inf and value % 1 == 0
-    ):
-        raise ValueError(f'step_limit is {value!r}; expected a positive integer or None')
-    return None if value is None else int(value)
+    if value is None:
+        return None
+    if not (errors.is_number(value) and 1 <= value < np.inf and value % 1 == 0):
+        raise ValueError(f'{name} is {value!r}; expected a positive integer or {none}')
+    return int(value)
 
 
 def check_time_limit(value: Any) -> float:
@@ -68,11 +53,26 @@ def check_time_limit(value: Any) -> float:
     return value
 
 
-def given_ids(env_ids: np.ndarray | Sequence[int] | None, num_envs: int) -> list[int]:
-    """Returns the numbers of simulations as they are given.
+def check_dtype(dtype: Any) -> np.dtype:
+    """Returns a type of observations.
+
+    Raises:
+      ValueError: it is neither float64 nor float32.
+    """
+    try:
+        found = np.dtype(dtype)
+    except TypeError:
+        found = np.dtype(object)
+    if found not in (np.dtype(np.float64), np.dtype(np.float32)):
+        raise ValueError(f'dtype is {dtype!r}; expected float64 or float32')
+    return found
+
+
+def given_ids(env_ids: Ids, num_envs: int) -> list[int]:
+    """Returns the indices of simulations as they are given.
 
     Args:
-      env_ids: numbers of simulations, or a mask (num_envs,) bool; None for all.
+      env_ids: indices of simulations, or a mask (num_envs,) bool; None for all.
       num_envs: number of all simulations.
 
     Raises:
@@ -90,7 +90,7 @@ def given_ids(env_ids: np.ndarray | Sequence[int] | None, num_envs: int) -> list
         return []
     if ids.dtype.kind not in 'iu' or ids.ndim > 1:
         raise TypeError(
-            f'env_ids is {env_ids!r}; expected integers, the numbers of simulations, or a mask '
+            f'env_ids is {env_ids!r}; expected integers, the indices of simulations, or a mask '
             f'of {num_envs} bools'
         )
     if ids.min() < 0 or ids.max() >= num_envs:
@@ -98,9 +98,22 @@ def given_ids(env_ids: np.ndarray | Sequence[int] | None, num_envs: int) -> list
     return ids.tolist()
 
 
-def unique_ids(env_ids: np.ndarray | Sequence[int] | None, num_envs: int) -> np.ndarray:
-    """Returns the numbers of simulations sorted and without repeats; see `given_ids`."""
+def unique_ids(env_ids: Ids, num_envs: int) -> np.ndarray:
+    """Returns the indices of simulations sorted and without repeats; see `given_ids`."""
     return np.unique(np.array(given_ids(env_ids, num_envs), int))
+
+
+def check_seed(name: str, seed: Any) -> None:
+    """Checks the seed of one random stream.
+
+    Raises:
+      TypeError: it is no integer.
+      ValueError: it is not in [0, 2**32).
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise TypeError(f'{name} is {seed!r}; expected a seed, an integer in [0, 2**32)')
+    if not 0 <= seed < 2**32:
+        raise ValueError(f'{name} is {seed}; expected a seed in [0, 2**32)')
 
 
 def all_seeds(seed: int | Sequence[int] | None, num_envs: int) -> np.ndarray:
@@ -113,33 +126,16 @@ def all_seeds(seed: int | Sequence[int] | None, num_envs: int) -> np.ndarray:
 
     Raises:
       TypeError: a seed that is not an integer.
-      ValueError: a negative seed, or a wrong number of seeds.
+      ValueError: a negative seed, a wrong number of seeds, or one that is no integer in [0, 2**32).
     """
     if seed is None or isinstance(seed, str) or not np.iterable(seed):
-        return _seed_sequence(seed).generate_state(num_envs, np.uint32)
-    return _seeds(seed, num_envs)
-
-
-def _seed_sequence(seed: Any) -> np.random.SeedSequence:
-    """Returns the sequence of a seed for all simulations.
-
-    Raises:
-      TypeError: it is not an integer.
-      ValueError: it is negative.
-    """
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
-        raise TypeError(f'seed is {seed!r}; expected an integer, one for each simulation, or None')
-    if seed is not None and seed < 0:
-        raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
-    return np.random.SeedSequence(seed)
-
-
-def _seeds(seed: Sequence[int], num_envs: int) -> np.ndarray:
-    """Returns the given seeds of all simulations, (n,).
-
-    Raises:
-      ValueError: there are not n, or they are no integers in [0, 2**32).
-    """
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
+            raise TypeError(
+                f'seed is {seed!r}; expected an integer, one for each simulation, or None'
+            )
+        if seed is not None and seed < 0:
+            raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
+        return np.random.SeedSequence(seed).generate_state(num_envs, np.uint32)
     try:
         seeds = np.asarray(seed)
     except ValueError:  # lists of different lengths

@@ -11,7 +11,8 @@ from dm_control import composer
 from dm_control.composer import observation as composer_observation
 from dm_env import specs
 
-from trl_suite.environments import arguments, states
+from trl_suite.environments import arguments
+from trl_suite.environments.core import Core
 from trl_suite.rendering import contexts
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors, interrupts
@@ -38,6 +39,10 @@ class Environment(composer.Environment):
     Only one thread may use an environment at a time; a second one is rejected.
 
     Attributes:
+      core: the simulation, see `trl_suite.environments.core`.
+      blocks: slice of each observation block in the flat vector.
+      action_map: the map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`).
+      step_limit: control steps after which an episode is truncated, or None.
       at_limit: whether the last step reached the step or time limit, also if it failed.
     """
 
@@ -69,25 +74,17 @@ class Environment(composer.Environment):
             `visualize_reward` that is no bool, or substep hooks.
           TypeError: a seed that is not an integer.
         """
-        step_limit = arguments.check_step_limit(step_limit)
-        time_limit = arguments.check_time_limit(time_limit)
-        if isinstance(random, (bool, float, str, bytes, np.random.Generator)):
-            raise TypeError(
-                f'random is {random!r}; expected a seed, an integer in [0, 2**32), or a '
-                'numpy.random.RandomState'
-            )
-        if isinstance(random, int) and not 0 <= random < 2**32:
-            raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
+        self.step_limit = arguments.check_step_limit(step_limit)
+        if isinstance(random, (int, float, str, bytes, np.random.Generator)):
+            arguments.check_seed('random', random)
         errors.check_kind('flat_observation', flat_observation, bool)
         errors.check_kind('visualize_reward', visualize_reward, bool)
         self._flat_observation = flat_observation
-        self._step_limit = step_limit
-        self._steps, self.at_limit = 0, False
-        self.one_thread = arguments.OneThread()  # entered by methods that use the simulation
+        self.at_limit = False
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
-            time_limit=time_limit,
+            time_limit=arguments.check_time_limit(time_limit),
             random_state=random,
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
@@ -97,9 +94,8 @@ class Environment(composer.Environment):
         # reset.
         self._mjcf_never_compiled = False
         self._colours = _colours(self._physics.model) if visualize_reward else None
-        self._signature = states.signature(task, 'single environment')
-        self._parts = tuple(task.blocks.items())
-        self._action_map = task.action_map
+        self.core = Core(task, 'single environment', [self._random_state])
+        self.blocks, self.action_map = dict(task.blocks), task.action_map
         # Whether there are hooks to call before or after a step. Checking them takes time.
         self._hooked = any(self._entity_hooks(name) for name in ('before_step', 'after_step'))
         for name in _SUBSTEP_HOOKS:
@@ -117,7 +113,7 @@ class Environment(composer.Environment):
         return [hook for hook in hooks if getattr(hook, '__func__', hook) is not empty]
 
     def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
-        self._check_open()
+        self.core.usable()
         if hook_name in _SUBSTEP_HOOKS:
             raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
         super().add_extra_hook(hook_name, hook_callable)
@@ -138,12 +134,10 @@ class Environment(composer.Environment):
         Raises:
           RuntimeError: after `close`, or while another thread uses the environment.
         """
-        with self.one_thread:
-            self._check_open()
-            self._steps, self.at_limit = 0, False
-            self._reset_next_step = False
-            if self._colours is not None:
-                self._show_reward(0.0)
+        with self.core as core:
+            core.restart(0)
+            self.at_limit = False
+            self._show_reward(0.0)
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
             if self._extra_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
@@ -159,50 +153,41 @@ class Environment(composer.Environment):
           ValueError: an action of the wrong shape, or with NaN or infinity.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
-        with self.one_thread:
-            self._check_open()
-            action = self._task.action_map.checked(action)
-            return self.reset() if self._reset_next_step else self._advance(action)
+        with self.core as core:
+            action = self.action_map.checked(action)
+            return self.reset() if core.ended[0] else self._advance(core, action)
 
-    def _advance(self, action: np.ndarray) -> dm_env.TimeStep:
+    def _advance(self, core: Core, action: np.ndarray) -> dm_env.TimeStep:
         """Takes one action within an episode."""
-        task, physics = self._task, self._physics_proxy
+        task, physics = core.task, self._physics_proxy
         if self._extra_observables:
             self._observation_updater.prepare_for_next_control_step()
         if self._hooked:
             self._hooks.before_step(physics, action, self._random_state)
-            task.simulate(task.world.all_ids)
+            task.simulate(core.world.all_ids)
             self._hooks.after_step(physics, self._random_state)
         else:
-            task.step(action[None], task.world.all_ids)
-        self._steps += 1
+            task.step(action[None], core.world.all_ids)
+        self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
         if self._extra_observables:
             self._observation_updater.update()
-        observation = self._observe()
-        failed = bool(task.failed[0])
-        self.at_limit = (self._step_limit is not None and self._steps >= self._step_limit) or bool(
-            self._time_limit < np.inf
-            and self._physics.time() >= self._time_limit - arguments.TIME_ERROR
-        )
-        self._reset_next_step = failed or self.at_limit
-        if self._colours is not None:
-            self._show_reward(float(task.reward[0]))
-        step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
-        return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
+        reward, failed = float(task.reward[0]), bool(task.failed[0])
+        self._show_reward(reward)
+        step_type = dm_env.StepType.LAST if core.ended[0] else dm_env.StepType.MID
+        return dm_env.TimeStep(step_type, reward, float(not failed), self._observe())
 
     def _show_reward(self, reward: float) -> None:
-        assert self._colours is not None
-        geoms, colours = self._colours
-        share = min(max(reward, 0.0), 1.0) ** 4
-        self._physics.model.geom_rgba[geoms, :3] = (
-            share * np.array(HIGHLIGHT) + (1 - share) * colours
-        )
+        if self._colours is not None:
+            geoms, colours = self._colours
+            share = min(max(reward, 0.0), 1.0) ** 4
+            shown = share * np.array(HIGHLIGHT) + (1 - share) * colours
+            self._physics.model.geom_rgba[geoms, :3] = shown
 
     def close(self) -> None:
         """Frees the simulation and the task. A second call does nothing."""
         # An interrupt halfway would leave a rendering context that is freed twice.
-        with self.one_thread, interrupts.postponed():
-            if self._physics is not None:
+        with interrupts.postponed():
+            if self.core.close():
                 super().close()
                 # These refer to arrays of the model and its data, and would keep them in memory.
                 del self._task, self._hooks, self._observation_updater
@@ -214,73 +199,43 @@ class Environment(composer.Environment):
         Raises:
           RuntimeError: after `close`.
         """
-        self._check_open()
-        return self._task
-
-    def _check_open(self) -> None:
-        if self._physics is None:
-            raise RuntimeError('the environment is closed')
+        return self.core.usable().task
 
     @property
     def physics(self) -> Any:
-        self._check_open()
+        self.core.usable()
         return super().physics
 
+    @property
+    def info(self) -> dict[str, Any]:
+        """Further results of the last step, by name: see the task's `info_arrays`."""
+        return self.task.info_of(0)
+
+    def observation(self) -> dict[str, np.ndarray]:
+        """Returns the observation of the current state, e.g. after `set_state`."""
+        self.core.usable()
+        return self._observe()
+
     def _observe(self) -> dict[str, np.ndarray]:
-        row = self.task.observation[0].copy()
-        if self._flat_observation:
-            observation = {FLAT_OBSERVATION_KEY: row}
-        else:
-            observation = {name: row[part] for name, part in self._parts}
+        row, found = self._task.observation[0].copy(), {}
+        if not self._flat_observation:
+            found = {name: row[part] for name, part in self.blocks.items()}
         if self._extra_observables:
             updated = self._observation_updater.get_observation()
-            extra = {name: np.asarray(updated[name], float) for name in self._extra_observables}
-            if self._flat_observation:
-                parts = [row, *(value.ravel() for value in extra.values())]
-                observation[FLAT_OBSERVATION_KEY] = np.concatenate(parts)
-            else:
-                observation.update(extra)
-        return observation
+            found |= {name: np.asarray(updated[name], float) for name in self._extra_observables}
+        if self._flat_observation:
+            parts = [row, *(value.ravel() for value in found.values())]
+            return {FLAT_OBSERVATION_KEY: np.concatenate(parts)}
+        return found
 
     def action_spec(self) -> specs.BoundedArray:
         return self.task.action_spec(self._physics_proxy)
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        self._check_open()
         return {
             name: specs.Array(value.shape, value.dtype, name)
-            for name, value in self._observe().items()
+            for name, value in self.observation().items()
         }
-
-    def reward_spec(self) -> specs.Array:
-        """Returns the spec of rewards, which are scalars."""
-        return specs.Array((), float, 'reward')
-
-    def discount_spec(self) -> specs.BoundedArray:
-        """Returns the spec of discounts: scalars in [0, 1]."""
-        return specs.BoundedArray((), float, 0.0, 1.0, 'discount')
-
-    @property
-    def blocks(self) -> dict[str, slice]:
-        """Slice of each observation block in the flat vector."""
-        return dict(self._parts)
-
-    @property
-    def action_map(self) -> Any:
-        """The map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`)."""
-        return self._action_map
-
-    @property
-    def step_limit(self) -> int | None:
-        return self._step_limit
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """Further results of the last step, by name: see the task's `info_arrays`."""
-        self._check_open()
-        return self._task.info_of(0)
-
-    # State.
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state: physics, task, terrain and random streams.
@@ -288,16 +243,7 @@ class Environment(composer.Environment):
         The dict holds arrays and plain values; it can be pickled, and restored by any environment
         that was built in the same way.
         """
-        with self.one_thread:
-            self._check_open()
-            return states.seal({
-                'made_for': dict(self._signature),
-                'world': self._task.world.get_state(0),
-                'task': self._task.get_state(0),
-                'random': self._random_state.get_state(),
-                'steps': self._steps,
-                'reset_next_step': self._reset_next_step,
-            })  # fmt: skip
+        return self.core.get_state()
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the same actions then give bit-identical results.
@@ -308,21 +254,10 @@ class Environment(composer.Environment):
             ground, or was changed after `get_state`; this environment is unchanged.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
-        with self.one_thread:
-            self._check_open()
-            states.check(state, self._signature)
-            self._task.set_state(0, state['task'])
-            self._task.world.set_state(0, state['world'])
-            self._random_state.set_state(state['random'])
-            self._steps = state['steps']
-            self._reset_next_step = state['reset_next_step']
+        with self.core as core:
+            core.set_state(state)
             if self._extra_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
-
-    def observation(self) -> dict[str, np.ndarray]:
-        """Returns the observation of the current state, e.g. after `set_state`."""
-        self._check_open()
-        return self._observe()
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.recipe is None:

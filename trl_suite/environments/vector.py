@@ -10,7 +10,6 @@ any number of simulations and threads, and whenever other simulations are reset.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,9 +17,11 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from trl_suite import rendering
+from trl_suite.engine import BatchWorld, light_model
 from trl_suite.environments import arguments, states
+from trl_suite.environments.arguments import Ids
+from trl_suite.environments.core import Core
 from trl_suite.environments.environment import Environment
-from trl_suite.environments.simulations import Simulations
 from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
@@ -60,7 +61,10 @@ class VectorEnvironment:
     `info['final_observation']`. With 'disabled', the caller resets simulations; stepping a
     simulation whose episode has ended raises an exception.
 
+    In all methods, `env_ids` are indices of simulations, or a mask (n,) bool; None for all.
+
     Attributes:
+      core: the simulations, see `trl_suite.environments.core`.
       num_envs: number of simulations n.
       seeds: seed of each simulation, (n,) uint32.
       at_limit: whether the last step reached the step or time limit, also if it failed, (n,) bool.
@@ -106,89 +110,72 @@ class VectorEnvironment:
         errors.check_whole('num_threads', num_threads, 0, MOST_THREADS, '; 0 uses all cores')
         if autoreset not in AUTORESET:
             raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
-        try:
-            known = np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.float32))
-        except TypeError:
-            known = False
-        if not known:
-            raise ValueError(f'dtype is {dtype!r}; expected float64 or float32')
         errors.check_kind('flat_observation', flat_observation, bool)
-        self.spec = spec_of(environment)
-        self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
+        self.spec, self.dtype = spec_of(environment), arguments.check_dtype(dtype)
+        self.num_envs, self.autoreset = int(num_envs), autoreset
         self.flat_observation = flat_observation
         self._task_kwargs = options = arguments.absolute(errors.options('task_kwargs', task_kwargs))
         if 'random' in options:
             raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
-        own = (
-            self.spec.step_limit if isinstance(step_limit, int) and step_limit == -1 else step_limit
-        )
-        self.step_limit = arguments.check_step_limit(options.pop('step_limit', own))
+        if isinstance(step_limit, int) and step_limit == -1:
+            step_limit = self.spec.step_limit
+        self.step_limit = arguments.check_step_limit(options.pop('step_limit', step_limit))
         self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
-        task = build_task(self.spec, self._task_kwargs)
-        self._simulations: Simulations | None = Simulations(task, self.num_envs, int(num_threads))
-        self._pid = os.getpid()
-        self._one_thread = arguments.OneThread()
+        task = build_task(self.spec, options)
+        model = light_model(task.root_entity.mjcf_model)
+        task.bind(BatchWorld(model, self.num_envs, int(num_threads), task.fields))
+        streams = [np.random.RandomState(0)] * self.num_envs
+        self.core = Core(task, 'vector environment', streams, threads=True)
         self.blocks, self.action_map = dict(task.blocks), task.action_map
         self.control_timestep: float = task.control_timestep
-        self.seeds = self._simulations.seeds
-        self.at_limit = np.zeros(self.num_envs, bool)
+        self.seeds, self.at_limit = self.core.seeds, np.zeros(self.num_envs, bool)
         self._picture: Environment | None = None
         self.seed(seed)
 
-    def seed(
-        self,
-        seed: int | Sequence[int] | None,
-        env_ids: np.ndarray | Sequence[int] | None = None,
-    ) -> None:
+    def seed(self, seed: int | Sequence[int] | None, env_ids: Ids = None) -> None:
         """Reseeds the random streams, from which resets draw, of some simulations or of all.
 
         Args:
           seed: one seed for all n simulations or n seeds, as for the constructor.
-          env_ids: numbers of the simulations to reseed, or a mask (n,) bool; None for all.
+          env_ids: simulations to reseed.
 
         Raises:
           TypeError: a seed that is not an integer.
           ValueError: a negative seed, or a wrong number of seeds.
         """
-        with self._one_thread:
-            simulations = self._usable()
+        with self.core as core:
             seeds = arguments.all_seeds(seed, self.num_envs)
-            simulations.seed(seeds, arguments.unique_ids(env_ids, self.num_envs))
+            for env_id in arguments.unique_ids(env_ids, self.num_envs).tolist():
+                core.seeds[env_id] = seeds[env_id]
+                core.random[env_id] = np.random.RandomState(int(seeds[env_id]))
 
-    def reset(
-        self,
-        env_ids: np.ndarray | Sequence[int] | None = None,
-        seed: int | Sequence[int] | None = None,
-    ) -> Any:
+    def reset(self, env_ids: Ids = None, seed: int | Sequence[int] | None = None) -> Any:
         """Begins an episode in some simulations, or in all; the others are unchanged.
 
         Args:
-          env_ids: numbers of simulations, or a mask (n,) bool; None for all.
+          env_ids: simulations in which an episode begins.
           seed: reseeds these simulations first: one seed for all n simulations or n seeds, as for
             the constructor.
 
         Returns:
           The observations of all simulations.
         """
-        with self._one_thread:
-            simulations = self._usable()
-            numbers = arguments.unique_ids(env_ids, self.num_envs)
-            if simulations.fresh and len(numbers) < self.num_envs:
+        with self.core as core:
+            ids = arguments.unique_ids(env_ids, self.num_envs)
+            if core.fresh and len(ids) < self.num_envs:
                 raise ValueError('the first reset must be of all simulations')
             if seed is not None:
-                self.seed(seed, numbers)
-            simulations.fresh = False
-            self.share(self.begin, numbers)
-            return self._observation()
+                self.seed(seed, ids)
+            self.share(self.begin, ids)
+            return self._blocks(core.task.observation.astype(self.dtype))
 
-    def step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None = None) -> Step:
+    def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
         """Takes one step in every simulation, or in some.
 
         Args:
           action: (n, k), clipped to [-1, 1].
-          env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others are not
-            stepped: their reward and its terms are 0, and their other entries of `info` are those
-            of their last step.
+          env_ids: simulations that take a step. The others are not stepped: their reward and its
+            terms are 0, and their other entries of `info` are those of their last step.
 
         Raises:
           ValueError: an action of the wrong shape, or with NaN or infinity; the message names the
@@ -197,22 +184,17 @@ class VectorEnvironment:
             thread uses the environment, or with autoreset 'disabled' for a simulation that has
             ended.
         """
-        with self._one_thread:
-            return self._step(self._usable(), action, env_ids)
+        with self.core as core:
+            return self._step(core, action, env_ids)
 
-    def _step(
-        self,
-        simulations: Simulations,
-        action: np.ndarray,
-        env_ids: np.ndarray | Sequence[int] | None,
-    ) -> Step:
-        if simulations.fresh:
+    def _step(self, core: Core, action: np.ndarray, env_ids: Ids) -> Step:
+        if core.fresh:
             raise RuntimeError('step before the first reset')
-        action = self.action_map.checked(action, self.num_envs)
-        task, world = simulations.task, simulations.world
-        steps, ended = simulations.steps, simulations.ended
-        asked = world.all_ids if env_ids is None else arguments.unique_ids(env_ids, self.num_envs)
-        resetting, env_ids = asked[ended[asked]], asked[~ended[asked]]
+        action, task = self.action_map.checked(action, self.num_envs), core.task
+        everyone = core.world.all_ids
+        asked = everyone if env_ids is None else arguments.unique_ids(env_ids, self.num_envs)
+        over = core.ended[asked]
+        resetting, stepped = asked[over], asked[~over]
         if len(resetting) and self.autoreset == 'disabled':
             raise RuntimeError(
                 f'simulation {resetting[0]} has ended; reset it, or choose another autoreset'
@@ -229,81 +211,61 @@ class VectorEnvironment:
 
         observation = np.empty(task.observation.shape, self.dtype)
         self.share(work, asked)
-        steps[env_ids] += 1
+        self.at_limit = np.zeros(self.num_envs, bool)
+        self.at_limit[stepped] = core.count(stepped, self.step_limit, self.time_limit)
         reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
-        if len(env_ids) < self.num_envs:
+        if len(stepped) < self.num_envs:
             resting = np.ones(self.num_envs, bool)
-            resting[env_ids] = False
+            resting[stepped] = False
             for each in (reward, terminated, *info.get('reward_terms', {}).values()):
                 each[resting] = 0
-        self.at_limit = truncated = np.zeros(self.num_envs, bool)
-        if self.step_limit is not None:
-            truncated[env_ids] = steps[env_ids] >= self.step_limit
-        if self.time_limit < np.inf:
-            truncated[env_ids] |= world.time[env_ids] >= self.time_limit - arguments.TIME_ERROR
-        truncated = truncated & ~terminated
-        ended[asked] = terminated[asked] | truncated[asked]
+        truncated = self.at_limit & ~terminated
         if self.autoreset == 'same_step':
-            info['ended'] = ended.copy()
+            info['ended'] = ended = core.ended.copy()
             if ended.any():
-                info['final_observation'] = self._observation()
+                info['final_observation'] = self._blocks(task.observation.astype(self.dtype))
                 self.share(self.begin, ended.nonzero()[0])
                 observation = task.observation.astype(self.dtype)
         if len(asked) < self.num_envs:
             observation = task.observation.astype(self.dtype)
         reward = reward.astype(self.dtype, copy=False)
-        return Step(self._parts(observation), reward, terminated, truncated, info)
+        return Step(self._blocks(observation), reward, terminated, truncated, info)
 
     @property
     def info(self) -> dict[str, Any]:
         """Further results of each simulation's last step or reset: see the task's `info`."""
-        return self._usable().task.info()
+        return self.task.info()
 
     def render(self, env_id: int = 0, **options: Any) -> np.ndarray:
         """Renders one simulation, (h, w, 3) uint8; options as for `trl_suite.rendering.frame`."""
-        with self._one_thread:
-            simulations = self._usable()
+        with self.core as core:
             if self._picture is None:  # the models of the simulations have no visual assets
                 self._picture = Environment(build_task(self.spec, self._task_kwargs))
                 self._picture.reset()
-            arguments.given_ids([env_id], self.num_envs)
-            self._picture.task.set_state(0, simulations.task.get_state(env_id))
-            self._picture.task.world.set_state(0, simulations.world.get_state(env_id))
+            ids = arguments.given_ids([env_id], self.num_envs)
+            self._picture.core.write(core.read(ids), [0])
             return rendering.frame(self._picture, **options)
 
     @property
     def task(self) -> Task:
         """The task, whose arrays have a leading axis of n simulations."""
-        return self._usable().task
+        return self.core.usable().task
 
     def close(self) -> None:
         """Frees the simulations; may be called twice."""
-        with self._one_thread:
-            if self._simulations is not None and os.getpid() == self._pid:
-                self._simulations.world.close()
-            self._simulations = None
-            if self._picture is not None:
-                self._picture.close()
-                self._picture = None
+        if self.core.close() and self._picture is not None:
+            self._picture.close()
 
-    def get_state(self, env_ids: np.ndarray | Sequence[int] | None = None) -> dict[str, Any]:
-        """Returns the complete state of some simulations, or of all.
+    def get_state(self, env_ids: Ids = None) -> dict[str, Any]:
+        """Returns the complete state of some simulations, or of all."""
+        return self.core.get_state(env_ids)
 
-        Args:
-          env_ids: numbers of m simulations, or a mask (n,) bool; None for all.
-        """
-        with self._one_thread:
-            return self._usable().get_state(arguments.given_ids(env_ids, self.num_envs))
-
-    def set_state(
-        self, state: dict[str, Any], env_ids: np.ndarray | Sequence[int] | None = None
-    ) -> None:
+    def set_state(self, state: dict[str, Any], env_ids: Ids = None) -> None:
         """Restores a state from `get_state` of an environment with the same id and options.
 
         Args:
           state: state of m simulations.
-          env_ids: numbers of the m simulations to restore, without repeats, or a mask (n,) bool;
-            None for all.
+          env_ids: the m simulations to restore, without repeats.
 
         Raises:
           TypeError: the state is not a dict.
@@ -312,13 +274,7 @@ class VectorEnvironment:
             `env_ids` is invalid; this environment is unchanged.
           RuntimeError: only some simulations are restored before the first reset.
         """
-        with self._one_thread:
-            simulations = self._usable()
-            if env_ids is not None and simulations.fresh:
-                raise RuntimeError('set_state of some simulations before the first reset')
-            simulations.set_state(state, arguments.given_ids(env_ids, self.num_envs))
-            if env_ids is None:
-                simulations.fresh = state['fresh']
+        self.core.set_state(state, env_ids)
 
     def copy_from(
         self, other: VectorEnvironment, other_ids: Sequence[int], env_ids: Sequence[int]
@@ -330,21 +286,20 @@ class VectorEnvironment:
 
         Args:
           other: environment with the same id and options, or this one.
-          other_ids: numbers of its simulations, whose states before the call are copied.
-          env_ids: numbers of as many simulations of this environment, without repeats.
+          other_ids: its simulations, whose states before the call are copied.
+          env_ids: as many simulations of this environment, without repeats.
 
         Raises:
           TypeError: `other` is not a vector environment.
-          ValueError: an environment with another id or options, or invalid simulation numbers.
+          ValueError: an environment with another id or options, or invalid indices.
           RuntimeError: one of the two environments was never reset.
         """
         if not isinstance(other, VectorEnvironment):
             raise TypeError(f'other is {type(other).__name__}; expected VectorEnvironment')
-        with self._one_thread, other._one_thread:
-            simulations, others = self._usable(), other._usable()
-            if simulations.fresh or others.fresh:
+        with self.core as core, other.core as others:
+            if core.fresh or others.fresh:
                 raise RuntimeError('copy_from before the first reset')
-            difference = states.differences(others.signature, simulations.signature)
+            difference = states.differences(others.signature, core.signature)
             if difference:
                 raise ValueError(
                     f'cannot copy simulations of {other.spec.id} to {self.spec.id}: {difference}'
@@ -356,7 +311,7 @@ class VectorEnvironment:
                     f'cannot copy {len(sources)} simulations to simulations {ids}; expected as many '
                     'different ones'
                 )
-            simulations.copy_from(others, sources, ids)
+            core.write(others.read(sources), ids)
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(
@@ -366,36 +321,21 @@ class VectorEnvironment:
 
     def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
         """Calls `work` on the threads, each time for a part of the simulations."""
-        simulations = self._usable()
-        if simulations.task.in_parts:
-            simulations.world.share(work, env_ids)
+        core = self.core.usable()
+        if core.task.in_parts:
+            core.world.share(work, env_ids)
         else:
             work(env_ids)
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Begins episodes in some simulations, without the checks and observations of `reset`."""
-        self._usable().begin(env_ids)
+        core = self.core.usable()
+        if len(env_ids):
+            core.task.reset(env_ids, [core.random[env_id] for env_id in env_ids.tolist()])
+            core.restart(env_ids)
 
-    def _observation(self) -> Any:
-        return self._parts(self._usable().task.observation.astype(self.dtype))
-
-    def _parts(self, flat: np.ndarray) -> Any:
+    def _blocks(self, flat: np.ndarray) -> Any:
         """Returns observations (n, size) in the form that the user gets: an array, or a dict."""
         if self.flat_observation:
             return flat
         return {name: flat[:, part] for name, part in self.blocks.items()}
-
-    def _usable(self) -> Simulations:
-        """Returns the simulations.
-
-        Raises:
-          RuntimeError: after `close`, or in a forked process.
-        """
-        if self._simulations is None:
-            raise RuntimeError('the environment is closed')
-        if os.getpid() != self._pid:
-            raise RuntimeError(
-                'a vector environment cannot be used after a fork: the child has no copy of its '
-                "threads. Make it in the child, or use multiprocessing's start method 'spawn'"
-            )
-        return self._simulations

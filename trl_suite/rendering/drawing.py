@@ -64,7 +64,7 @@ def frame(
       RuntimeError: no OpenGL library works (the message names MUJOCO_GL and its choices), this
         process was forked from one that has rendered, or another thread uses the environment.
     """
-    with getattr(environment, 'one_thread', contextlib.nullcontext()):
+    with getattr(environment, 'core', contextlib.nullcontext()):
         return _frame(environment, height, width, camera, ghost)
 
 
