@@ -266,6 +266,16 @@ class SingleTest(Same, parameterized.TestCase):
             self.assertEqual(repr(env.step(idle)), repr(twin.step(idle)))
         np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
 
+    def test_a_restored_episode_goes_on(self):
+        env, idle = SuiteEnv(FLAT, task_kwargs={'step_limit': 2}), np.zeros(6)
+        env.reset(seed=2)
+        state = env.environment.get_state()
+        first = [env.step(idle)[1] for _ in range(2)]
+        with self.assertRaises(gymnasium.error.ResetNeeded):
+            env.step(idle)
+        env.environment.set_state(state)
+        self.assertEqual([env.step(idle)[1] for _ in range(2)], first)
+
     def test_render(self):
         env = gymnasium.make(
             f'trl_suite/{GAPS}', render_mode='rgb_array', render_kwargs={**SMALL, 'ghost': True}
@@ -514,6 +524,26 @@ class VectorTest(Same, parameterized.TestCase):
         np.testing.assert_array_equal(frames[1], single.render())
         self.assertTrue((frames[0] != frames[1]).any())
         self.assertIsNone(SuiteVectorEnv(GAPS, 1).render())
+
+    def test_attributes_of_each_simulation(self):
+        options = {'render_mode': 'rgb_array', 'render_kwargs': SMALL}
+        ours = SuiteVectorEnv(FLAT, 2, num_threads=1, **options)
+        theirs = SyncVectorEnv([lambda: SuiteEnv(FLAT, **options) for _ in range(2)])
+        for each in ours, theirs:
+            each.reset(seed=[4, 7])
+        for name in 'render_mode', 'observation_space', 'action_space':
+            for read in 'call', 'get_attr':
+                self.assertEqual(getattr(ours, read)(name), getattr(theirs, read)(name), name)
+        np.testing.assert_array_equal(ours.call('render'), theirs.call('render'))
+        self.assertEqual(ours.get_attr('step_limit'), (256, 256))
+        self.assertEqual(ours.get_attr('seeds'), (4, 7))  # each has its own
+        with self.assertRaisesRegex(AttributeError, "no attribute 'step_limt'"):
+            ours.get_attr('step_limt')
+        with self.assertRaisesRegex(RuntimeError, 'share one object: call get_state of its'):
+            ours.call('get_state')
+        with self.assertRaisesRegex(RuntimeError, 'share one object: set step_limit on its'):
+            ours.set_attr('step_limit', [3, 4])
+        self.assertEqual(SuiteVectorEnv(FLAT, 2, num_threads=1).call('render'), (None, None))
 
     def test_misuse_raises_errors(self):
         with self.assertRaisesRegex(ValueError, 'NextStep'):

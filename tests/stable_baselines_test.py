@@ -123,6 +123,7 @@ class StableBaselinesTest(parameterized.TestCase):
         envs = SuiteVecEnv(FLAT, 3, 1)
         self.assertEqual(envs.get_attr('step_limit'), [256] * 3)
         self.assertEqual(envs.get_attr('step_limit', [0, 2]), [256] * 2)
+        self.assertEqual(envs.get_attr('seeds', [2]), [envs.environment.seeds[2]])
         self.assertFalse(envs.has_attr('terrain'))
         self.assertEqual(envs.env_is_wrapped(gymnasium.Wrapper), [False] * 3)
         with self.assertRaisesRegex(RuntimeError, 'environment'):

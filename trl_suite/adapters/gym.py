@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from trl_suite import rendering, suite
+from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry import catalogue
@@ -34,7 +35,7 @@ try:
     import gymnasium
     from gymnasium import spaces
     from gymnasium.vector import AutoresetMode
-    from gymnasium.vector.utils import iterate
+    from gymnasium.vector.utils import batch_space, iterate
 except ImportError as error:
     message = (
         f"trl_suite.adapters.gym needs Gymnasium ({error}): pip install 'trl_suite[gymnasium]'"
@@ -44,6 +45,7 @@ except ImportError as error:
 METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most ids
 BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; others are unbounded
 RENDER_OPTIONS = tuple(inspect.signature(rendering.frame).parameters)[1:]
+ONE_OBJECT = 'simulations share one object'
 Info = dict[str, Any]
 
 
@@ -81,6 +83,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
           ValueError: unknown names or options; the message has the closest matches.
         """
+        self._flat, self._dtype = flat_observation, arguments.check_dtype(dtype)
         if not isinstance(environment, Environment):
             spec = catalogue.spec_of(environment)
             environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
@@ -88,63 +91,45 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
             raise ValueError(
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'
             )
-        self.environment, self._flat, self._dtype = environment, flat_observation, np.dtype(dtype)
-        self.render_mode = render_mode
+        self.environment, self.render_mode = environment, render_mode
         self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
         self.metadata = metadata(environment.task)
         shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
-        self.observation_space = observation_space(shapes, flat_observation, dtype)
-        self.action_space = action_space((len(environment.action_map),), dtype)
-        self._running, self._closed = False, False
+        self.observation_space = observation_space(shapes, flat_observation, self._dtype)
+        self.action_space = action_space(environment, self._dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Starts an episode, seeded if `seed`, in [0, 2**32), is given; there are no options."""
-        self._check_open()
         if seed is not None:
-            if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-                raise TypeError(f'seed is {seed!r}; expected an integer in [0, 2**32)')
-            if not 0 <= seed < 2**32:
-                raise ValueError(f'seed is {seed}; expected an integer in [0, 2**32)')
+            arguments.check_seed('seed', seed)
             seed = int(seed)
             self.environment.random_state.seed(seed)
         super().reset(seed=seed)
         time_step = self.environment.reset()
-        self._running = True
         return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
         """Applies one action, clipped to [-1, 1]; raises `ResetNeeded` if no episode is running."""
-        self._check_open()
-        if not self._running:
+        if self.environment.core.usable().ended[0]:
             raise gymnasium.error.ResetNeeded('no episode is running; call reset first')
         time_step = self.environment.step(action)
-        last = time_step.last()
-        terminated = last and time_step.discount == 0
-        self._running = not last
+        terminated = time_step.last() and time_step.discount == 0
         observation, info = self._observation(time_step.observation), flat(self.environment.info)
-        return observation, float(time_step.reward), terminated, self.environment.at_limit, info
+        return observation, time_step.reward, terminated, self.environment.at_limit, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Draws the current state, (h, w, 3) uint8; None if render_mode is None."""
-        self._check_open()
+        self.environment.core.usable()
         return self.render_mode and rendering.frame(self.environment, **self._render_kwargs)  # type: ignore[return-value]
 
     def close(self) -> None:
         """Frees the simulation; may be called twice."""
-        if not self._closed:
-            self._closed = True
-            self.environment.close()
+        self.environment.close()
 
     def _observation(self, blocks: Mapping[str, np.ndarray]) -> Any:
         if self._flat:
-            if len(blocks) == 1:
-                return next(iter(blocks.values())).astype(self._dtype)
             return np.concatenate([part.ravel() for part in blocks.values()], dtype=self._dtype)
         return {name: part.astype(self._dtype) for name, part in blocks.items()}
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise RuntimeError('the environment is closed')
 
 
 class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
@@ -178,20 +163,19 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         self.autoreset_mode = modes[mode]  # as in Gymnasium; TorchRL reads it
         spec = catalogue.spec_of(environment)
         options = limited(task_kwargs, max_episode_steps)
-        self.environment = VectorEnvironment(
+        self.environment = made = VectorEnvironment(
             spec, num_envs, num_threads, options.pop('random', None),
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
             task_kwargs=options,
         )  # fmt: skip
-        self.render_mode = render_mode
-        self._render_kwargs = rendered(render_mode, render_kwargs, self.environment.task)
-        self.metadata = {**metadata(self.environment.task), 'autoreset_mode': modes[mode]}
-        self.num_envs = n = self.environment.num_envs
-        shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
-        self.single_observation_space = observation_space(shapes, flat_observation, dtype)
-        self.observation_space = observation_space(shapes, flat_observation, dtype, (n,))
-        self.action_space = action_space((n, len(self.environment.action_map)), dtype)
-        self.single_action_space = action_space(self.action_space.shape[1:], dtype)
+        self.num_envs, self.render_mode = made.num_envs, render_mode
+        self._render_kwargs = rendered(render_mode, render_kwargs, made.task)
+        self.metadata = {**metadata(made.task), 'autoreset_mode': modes[mode]}
+        shapes = {name: (part.stop - part.start,) for name, part in made.blocks.items()}
+        self.single_observation_space = observation_space(shapes, flat_observation, made.dtype)
+        self.single_action_space = action_space(made, made.dtype)
+        self.observation_space = batch_space(self.single_observation_space, made.num_envs)
+        self.action_space = batch_space(self.single_action_space, made.num_envs)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
@@ -225,11 +209,31 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Draws every simulation; None if render_mode is None."""
-        env_ids = range(self.num_envs if self.render_mode else 0)
-        return (
-            tuple(self.environment.render(env_id, **self._render_kwargs) for env_id in env_ids)
-            or None
-        )
+        if self.render_mode is None:
+            return None
+        env_ids = range(self.num_envs)
+        return tuple(self.environment.render(env_id, **self._render_kwargs) for env_id in env_ids)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Returns an attribute, or with the name 'render' the picture, of each simulation.
+
+        Raises:
+          AttributeError: there is no such attribute.
+          RuntimeError: another method, since it would concern all simulations.
+        """
+        if name == 'render':
+            return self.render() or (None,) * self.num_envs
+        values = attributes(self, f'single_{name}', name)
+        if callable(values[0]):
+            raise RuntimeError(f'{ONE_OBJECT}: call {name} of its `environment`')
+        return tuple(values)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Returns an attribute of each simulation; see `call`."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        raise RuntimeError(f'{ONE_OBJECT}: set {name} on its `environment`')
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulations."""
@@ -261,41 +265,48 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
     is not given, and -1 for no limit.
     """
     options = errors.options('task_kwargs', task_kwargs)
-    if max_episode_steps is None:
-        return options
-    whole = isinstance(max_episode_steps, (int, np.integer)) and not isinstance(
-        max_episode_steps, bool
-    )
-    if whole and max_episode_steps == -1:
+    if max_episode_steps == -1:
         return {'step_limit': None, **options}
-    if not whole or max_episode_steps < 1:
-        raise ValueError(
-            f'max_episode_steps is {max_episode_steps!r}; expected a positive integer, or -1 for no '
-            'limit'
-        )
-    own = options.get('step_limit')
-    options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
+    limit = arguments.check_step_limit(max_episode_steps, 'max_episode_steps', '-1 for no limit')
+    if limit is not None:
+        own = options.get('step_limit')
+        options['step_limit'] = limit if own is None else min(own, limit)
     return options
 
 
 def observation_space(
-    shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any, n: tuple[int, ...] = ()
-) -> spaces.Box | spaces.Dict:
-    """Returns the space of blocks of these shapes, flat or not; `n` is (num_envs,) or ()."""
-    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
-        raise ValueError(f'dtype is {np.dtype(dtype)}; expected float32 or float64')
+    shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any
+) -> gymnasium.Space[Any]:
+    """Returns the space of blocks of these shapes, flat or not."""
     bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
-    boxes = [(key, spaces.Box(*bounds[key], (*n, *shapes[key]), dtype)) for key in shapes]
-    if not flat:
-        return spaces.Dict(boxes)  # pairs, as Dict would sort the keys of a dict
-    low = np.concatenate([box.low.reshape(*n, -1) for _, box in boxes], -1)
-    high = np.concatenate([box.high.reshape(*n, -1) for _, box in boxes], -1)
-    return spaces.Box(low, high, dtype=dtype)
+    boxes = [(name, spaces.Box(*bounds[name], shape, dtype)) for name, shape in shapes.items()]
+    # Pairs, as Dict would sort the keys of a dict.
+    return spaces.flatten_space(spaces.Dict(boxes)) if flat else spaces.Dict(boxes)
 
 
-def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
-    """Returns the action space, [-1, 1] in every dimension."""
-    return spaces.Box(-1.0, 1.0, shape, dtype)
+def action_space(environment: Environment | VectorEnvironment, dtype: Any) -> spaces.Box:
+    """Returns the action space of one simulation, [-1, 1] in every dimension."""
+    return spaces.Box(-1.0, 1.0, (len(environment.action_map),), dtype)
+
+
+def attributes(adapter: Any, *names: str) -> list[Any]:
+    """Returns an attribute of an adapter or of its `environment`, once for each simulation.
+
+    Args:
+      adapter: an object with the attributes `num_envs` and `environment`.
+      names: of the attribute; the first that exists counts. Of an array (n,), each simulation gets
+        its own element.
+
+    Raises:
+      AttributeError: there is no such attribute.
+    """
+    for owner in (adapter, adapter.environment):
+        for name in names:
+            if hasattr(owner, name):
+                value, n = getattr(owner, name), adapter.num_envs
+                own = isinstance(value, np.ndarray) and value.shape == (n,)
+                return list(value) if own else [value] * n
+    raise AttributeError(f'no attribute {names[-1]!r}')
 
 
 def flat(info: Info) -> Info:

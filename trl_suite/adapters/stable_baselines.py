@@ -17,7 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.adapters.gym import action_space, flat, observation_space, rendered
+from trl_suite.adapters.gym import (
+    ONE_OBJECT,
+    action_space,
+    attributes,
+    flat,
+    observation_space,
+    rendered,
+)
 from trl_suite.environments import arguments
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
@@ -71,11 +78,11 @@ class SuiteVecEnv(VecEnv):
             raise ValueError(f"autoreset is {environment.autoreset!r}; expected 'same_step'")
         self.environment, self.render_mode = environment, render_mode
         self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
-        shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
+        shapes = {name: (part.stop - part.start,) for name, part in environment.blocks.items()}
         super().__init__(
-            self.environment.num_envs,
+            environment.num_envs,
             observation_space(shapes, environment.flat_observation, environment.dtype),
-            action_space((len(self.environment.action_map),), np.float32),
+            action_space(environment, np.float32),
         )
 
     def seed(self, seed: int | None = None) -> list[int]:
@@ -128,17 +135,16 @@ class SuiteVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Returns an attribute of this object or of `environment`, once for each index."""
-        owner = self if attr_name in ('render_mode', 'observation_space', 'action_space') else None
-        value = getattr(owner or self.environment, attr_name)
-        return [value for _ in self._get_indices(indices)]
+        values = attributes(self, attr_name)
+        return [values[env_id] for env_id in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        raise RuntimeError(f'simulations share one object: set {attr_name} on its `environment`')
+        raise RuntimeError(f'{ONE_OBJECT}: set {attr_name} on its `environment`')
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        raise RuntimeError(f'simulations share one object: call {method_name} of its `environment`')
+        raise RuntimeError(f'{ONE_OBJECT}: call {method_name} of its `environment`')
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """Returns False for every simulation: none has a Gymnasium wrapper."""
