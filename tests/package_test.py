@@ -60,6 +60,8 @@ class PinTest(absltest.TestCase):
         cases = {
             'suite': 'import trl_suite.suite',
             'gymnasium': 'import trl_suite.gym',
+            'vector': 'import trl_suite.vector',
+            'evaluation': 'from trl_suite import evaluation',
             **{
                 name: f'from trl_suite import cli; sys.exit(cli.main({name.split()}))'
                 for name in (f'evaluate {TRAINED} --policy zero', f'bench {TRAINED}', 'try a.xml')

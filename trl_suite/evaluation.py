@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 import tqdm
 
+import trl_suite.suite  # noqa: F401  tells what to install if dm_control is missing
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
