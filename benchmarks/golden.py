@@ -3,6 +3,8 @@
     python benchmarks/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
     python benchmarks/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
     python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  expected by the test
+    python benchmarks/golden.py check tests/golden.json [--filter PATTERN]  compares without the
+                        test, and with an engine that dm_control does not support yet
 
 Only the public interface is used, so that one version of the suite can record and another compare;
 PYTHONPATH selects the version. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'.
@@ -38,6 +40,7 @@ import zlib
 
 import mujoco
 import numpy as np
+from dm_control.mujoco.wrapper.mjbindings.sizes import array_sizes
 from tqdm import tqdm
 
 from trl_suite import policies, suite, terrain
@@ -521,14 +524,56 @@ def agreeing(expected, found):
     return int(np.logical_and.accumulate(np.all(near, axis=0)).sum())
 
 
+def check(path, pattern):
+    """Prints in which environments the first steps differ from the stored ones, and from where.
+
+    Returns whether there is no such environment.
+    """
+    lacks = unsupported()
+    print(f'{versions()}; dm_control knows, but MuJoCo lacks: {", ".join(lacks) or "nothing"}')
+    stored, counts = json.loads(pathlib.Path(path).read_text()), {'equal': 0, 'different': 0}
+    for id_ in fnmatch.filter(stored, f'*{pattern}*'):
+        seed, steps = stored[id_].pop('seed'), LONG if is_long(id_) else STEPS
+        try:
+            found = summary(id_, seed)
+            lines = [
+                f'{name}: by {abs(b - a):.1e} in step {step}'
+                for name, values in stored[id_].items()
+                for step, a, b in zip(steps, values, found[name], strict=False)
+                if not np.isclose(a, b, TOLERANCE, TOLERANCE)
+            ]
+        except Exception as error:  # reported, so that the other environments are still checked
+            lines = [f'{type(error).__name__}: {error}']
+        counts['different' if lines else 'equal'] += 1
+        if lines:
+            print('\n    '.join([id_, *lines]), flush=True)
+    print(', '.join(f'{count} {word}' for word, count in counts.items()))
+    return not counts['different']
+
+
+def unsupported():
+    """Removes fields that this engine lacks from dm_control's table; returns their names."""
+    model = mujoco.MjModel.from_xml_string('<mujoco/>')
+    missing = []
+    for struct in (model, mujoco.MjData(model)):
+        table = array_sizes[type(struct).__name__.lower()]
+        lacking = [name for name in table if not hasattr(struct, name)]
+        missing += [f'{type(struct).__name__}.{name}' for name in lacking]
+        for name in lacking:
+            del table[name]
+    return missing
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('command', choices=('record', 'compare', 'store'))
+    parser.add_argument('command', choices=('record', 'compare', 'store', 'check'))
     parser.add_argument('file')
     parser.add_argument('--filter', default='', metavar='PATTERN')
     arguments = parser.parse_args()
     if arguments.command == 'store':
         store(arguments.file, arguments.filter)
+    elif arguments.command == 'check':
+        sys.exit(not check(arguments.file, arguments.filter))
     elif arguments.command == 'record':
         record(arguments.file, arguments.filter)
     else:

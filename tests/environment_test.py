@@ -1,10 +1,13 @@
 """Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
+import contextlib
 import gc
 import importlib.util
+import io
 import json
 import pathlib
 import pickle
+import tempfile
 import threading
 import weakref
 from unittest import mock
@@ -412,6 +415,16 @@ class PlainComposerTest(parameterized.TestCase):
 class GoldenTest(absltest.TestCase):
     def test_all_environments_are_stored(self):
         self.assertCountEqual(STORED, suite.ALL_IDS)
+
+    def test_a_check_tells_what_differs(self):
+        id_ = 'PD_Dog2D_Flat-v0'
+        path = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()), 'stored.json')
+        for reward, differs in ((0.0, ''), (0.5, f'{id_}\n    reward: by 5.0e-01 in step 0\n')):
+            stored = {**STORED[id_], 'reward': [reward, *STORED[id_]['reward'][1:]]}
+            path.write_text(json.dumps({id_: stored}))
+            with contextlib.redirect_stdout(io.StringIO()) as printed:
+                self.assertEqual(GOLDEN.check(path, ''), not differs)
+            self.assertIn(f'MuJoCo lacks: nothing\n{differs}', printed.getvalue())
 
 
 for _id in suite.ALL_IDS:

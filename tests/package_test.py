@@ -48,7 +48,8 @@ class PinTest(absltest.TestCase):
         self.assertIn("'dm-control>=1.0.50", required.replace('"', "'"))
 
     def test_pages_install_the_version_of_dm_control_that_messages_name(self):
-        pages = [CHECKOUT / 'README.md', CHECKOUT / 'CONTRIBUTING.md', CHECKOUT / '.ci/run']
+        names = 'README.md', 'CONTRIBUTING.md', '.ci/run', '.ci/newest_engine'
+        pages = [CHECKOUT / name for name in names]
         for page in (*pages, *(CHECKOUT / 'docs').glob('*.md')):
             found = re.findall(r'--no-deps dm-control\S*', page.read_text('utf-8'))
             self.assertLessEqual({*found}, {libraries.DM_CONTROL}, page.name)
