@@ -49,7 +49,7 @@ from torch import nn
 from trl_suite import characters, evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import errors
+from trl_suite.util import errors, machine
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -709,6 +709,7 @@ class Learner:
                 'seed': self.seed,
                 'samples': self.samples,
                 'character': characters.fingerprint(environments.task.character.spec),
+                **machine.made_with(),
             },
         )  # fmt: skip
 

@@ -38,7 +38,7 @@ from torch.optim import swa_utils
 from trl_suite import characters, evaluation, policies, suite
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.util import errors
+from trl_suite.util import errors, machine
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -688,6 +688,7 @@ class Trainer:
                 'seed': self.seed,
                 'samples': self.samples,
                 'character': characters.fingerprint(self.environments.task.character.spec),
+                **machine.made_with(),
             },
             mirror=self.mirror,
         )

@@ -32,7 +32,7 @@ import tqdm
 
 from trl_suite import characters, evaluation, policies
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import archive, files
+from trl_suite.util import archive, files, machine
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -189,6 +189,7 @@ class Learner:
                 'seed': seed,
                 'samples': samples,
                 'character': characters.fingerprint(environments.task.character.spec),
+                **machine.made_with(),
             },
         )
 

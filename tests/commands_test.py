@@ -13,8 +13,9 @@ from absl.testing import absltest, parameterized
 from PIL import Image
 
 from trl_suite import motion, policies, suite
-from trl_suite.cli import bench, doctor, machine
+from trl_suite.cli import bench, doctor
 from trl_suite.environments import named_policies as acting
+from trl_suite.util import machine
 
 GAPS = cli_test.GAPS
 SETUP = pathlib.Path(__file__).resolve().parents[1] / 'setup.py'

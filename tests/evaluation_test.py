@@ -10,6 +10,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import evaluation, policies, suite
+from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -84,6 +85,7 @@ class EvaluateTest(parameterized.TestCase):
     def test_results_do_not_depend_on_threads_and_chunks(self):
         policy = make(GAPS)
         expected = evaluation.evaluate(GAPS, policy, 7, 2, num_threads=1)
+        self.assertLessEqual(machine.made_with().items(), expected.items())
         self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2, num_threads=2), expected)
         with mock.patch.object(evaluation, 'CHUNK', 3):
             self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2), expected)

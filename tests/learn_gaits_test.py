@@ -10,6 +10,7 @@ import torch
 from absl.testing import absltest, parameterized
 
 from trl_suite import policies
+from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -290,6 +291,7 @@ class LearnTest(parameterized.TestCase):
             policy = policies.load(folders[0] / 'policy.npz')
             policy.check(VectorEnvironment(HOPPER, 1, 1))
             self.assertEqual(policy.info['samples'], 48)
+            self.assertLessEqual(machine.made_with().items(), policy.info.items())
             # Another final phase is repeated, from the same transitions.
             members = settings.members + 1
             more = dataclasses.replace(settings, members=members)

@@ -17,6 +17,7 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import evaluation, policies, terrain
 from trl_suite.registry import catalogue
+from trl_suite.util import machine
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import checkpoints
@@ -167,6 +168,7 @@ class RunTest(parameterized.TestCase):
         self.assertEqual([point['samples'] for point in whole], [128, 256, 384, 512])
         for name in ('policy.npz', 'last.npz'):
             one, two = (policies.load(self.folder / run / name) for run in ('whole', 'parts'))
+            self.assertLessEqual(machine.made_with().items(), one.info.items())
             for a, b in zip(one.weights + one.biases, two.weights + two.biases, strict=True):
                 np.testing.assert_array_equal(a, b)
         with self.assertRaisesRegex(ValueError, 'other settings'):

@@ -8,6 +8,7 @@ import numpy as np
 from absl.testing import absltest
 
 from trl_suite import policies
+from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -65,6 +66,7 @@ class SearchTest(absltest.TestCase):
             policy = policies.load(folder / 'last.npz')
             policy.check(VectorEnvironment(HOPPER, 1, 1))
             self.assertEqual(policy.info['samples'], 8)
+            self.assertLessEqual(machine.made_with().items(), policy.info.items())
             again = search_gaits.train(HOPPER, 1, TINY, folder, 1)
             self.assertEqual(again, curve)  # there was nothing left to do
             with self.assertRaisesRegex(ValueError, 'other settings'):

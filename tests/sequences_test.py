@@ -18,6 +18,7 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import evaluation, sequences, suite
 from trl_suite.sequences import results
+from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -292,6 +293,25 @@ class RunTest(parameterized.TestCase):
             [path.name for path in self.folder.iterdir()], ['whole.json', 'result.json']
         )
 
+    def test_a_run_that_resumes_on_another_machine(self):
+        def made(mujoco, cpu):
+            return mock.patch.object(machine, 'made_with', lambda: {'mujoco': mujoco, 'cpu': cpu})
+
+        with made('3.17.0', 'x86_64 AVX2'):
+            part = self.run_short(Keeper(), stages=1)
+        self.assertEqual((part['mujoco'], part['cpu']), ('3.17.0', 'x86_64 AVX2'))
+        with (
+            made('3.18.0', 'x86_64 AVX2'),
+            self.assertRaisesRegex(ValueError, 'with another mujoco: 3.17.0; expected 3.18.0'),
+        ):
+            self.run_short(Keeper())
+        for cpu in ('x86_64 AVX-512', 'x86_64 AVX2'):
+            with made('3.17.0', cpu):
+                result = self.run_short(Keeper(), stages=2 + (cpu == 'x86_64 AVX2'))
+        self.assertEqual(result['cpu'], 'x86_64 AVX2, x86_64 AVX-512')
+        with made('3.17.0', 'arm64'):  # a finished result is left alone
+            self.assertEqual(self.run_short(Keeper()), result)
+
     def test_a_run_in_parts(self):
         whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
         part = self.run_short(Keeper(), stages=2)
@@ -471,6 +491,16 @@ class ResultTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'digest is .* changed after the run'):
             sequences.check(self.changed(name, value, digest=False))
 
+    def test_what_it_was_made_with_may_be_missing(self):
+        self.assertEqual(
+            {name: self.result[name] for name in results.MADE_WITH}, machine.made_with()
+        )
+        for name in results.MADE_WITH:
+            with self.assertRaisesRegex(ValueError, f'{name} is 4; expected a string'):
+                sequences.check(self.changed(name, 4))
+            del self.result[name]
+        sequences.check(self.changed('seed', 0))
+
     def test_missing_fields(self):
         for name in (*results.FIELDS, 'metrics'):
             result = {key: value for key, value in self.result.items() if key != name}
@@ -523,7 +553,10 @@ class CommandTest(cli_test.CommandTest):
         self.assertEqual(np.trace(result['samples']), np.sum(result['samples']))
         self.assertEqual(np.sum(result['samples']), 5 * 4)
         out = self.output('sequences', 'check', 'result.json')
-        self.assertRegex(out, 'my_learner:Nothing, plaid_biped.*not comparable: budget is 100, not')
+        made = f'mujoco {result["mujoco"]}, cpu {result["cpu"]}'
+        self.assertRegex(
+            out, f'my_learner:Nothing, plaid_biped.*, {made}: not comparable: budget is 100, not'
+        )
         result['learner'] = '\x1b]0;title\x07a\nvalid and comparable'
         result['digest'] = sequences.results.digest(result)
         pathlib.Path('forged.json').write_text(json.dumps(result))

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 import textwrap
+from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -21,6 +22,7 @@ from trl_suite.registry import catalogue
 from trl_suite.tasks import parts
 from trl_suite.tasks.imitation.planar import PlanarImitation
 from trl_suite.terrain import from_function, from_heights, load
+from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = (
@@ -385,6 +387,18 @@ class SignatureTest(parameterized.TestCase):
         environment = self.build(terrain='gaps_humanoid')
         environment.reset()
         self.build(terrain=ground, clip=clip).set_state(environment.get_state())
+
+    def test_the_class_of_cpu_is_named_and_does_not_count(self):
+        environment, name = suite.make(DOG, {'random': 6}), machine.cpu_class()
+        state = environment.get_state()
+        with mock.patch.object(machine, 'cpu_class', lambda: 'another'):
+            other = suite.make(DOG, {'random': 6})
+        other.set_state(state)
+        label, _ = state['made_for']['environment']
+        self.assertEndsWith(label, f' on {name}')
+        self.assertEqual(
+            other.get_state()['made_for']['environment'][0], label.replace(name, 'another')
+        )
 
     def test_a_sealed_state_is_its_owners_deed(self):
         environment = suite.make(DOG, {'random': 6})

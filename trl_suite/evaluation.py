@@ -23,7 +23,7 @@ from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.navigation.scripted import scripted
-from trl_suite.util import errors
+from trl_suite.util import errors, machine
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 MOST_EPISODES = 1_000_000
@@ -91,6 +91,7 @@ def evaluate(
       (m), 'speed' (total distance over total time, m/s), 'falls' and 'diverged' (shares of
       episodes).
       Lists, one entry per episode: 'seeds', 'returns', 'lengths', 'distances', 'fell'.
+      'mujoco' (its version) and 'cpu' (classes of the processors), on which the last bits depend.
 
     Raises:
       ValueError: unknown names or options, numbers out of range, or an incompatible `Policy`.
@@ -138,9 +139,12 @@ def evaluate_all(
             for part in each:
                 done.append(part)
                 bar.update()
-            id_, step_limit, _ = done[0]
-            of = {name: np.concatenate([part[name] for *_, part in done]) for name in done[0][2]}
-            results.append(_summary(id_, step_limit, seeds, seed, of))
+            id_, step_limit, made, first = done[0]
+            of = {name: np.concatenate([part[name] for *_, part in done]) for name in first}
+            # An executor may have run parts on other processors.
+            cpus = ', '.join(sorted({part['cpu'] for _, _, part, _ in done}))
+            summary = _summary(id_, step_limit, seeds, seed, of)
+            results.append({**summary, **made, 'cpu': cpus})
     return results
 
 
@@ -166,8 +170,11 @@ def _run(
     task_kwargs: Mapping[str, Any] | None,
     factory: bool,
     progress: bool,
-) -> tuple[str, int, dict[str, np.ndarray]]:
-    """Runs one episode per seed, all at the same time; returns id, step limit and results."""
+) -> tuple[str, int, dict[str, str], dict[str, np.ndarray]]:
+    """Runs one episode per seed, all at the same time.
+
+    Returns id, step limit, `machine.made_with()` and results.
+    """
     environments = VectorEnvironment(
         environment, len(seeds), num_threads, seeds, autoreset='disabled', task_kwargs=task_kwargs
     )
@@ -180,7 +187,7 @@ def _run(
         silent = None if progress else True
         with tqdm.tqdm(total=step_limit, delay=PROGRESS_DELAY, disable=silent, unit='step') as bar:
             act = policy(environments) if factory else policy
-            return id_, step_limit, _episodes(environments, act, bar)
+            return id_, step_limit, machine.made_with(), _episodes(environments, act, bar)
     finally:
         environments.close()
 

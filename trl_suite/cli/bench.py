@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.cli import engine, machine
+from trl_suite.cli import engine
 from trl_suite.cli.arguments import add_command, add_file, add_id, add_threads, positive
-from trl_suite.util import files
+from trl_suite.util import files, machine
 
 if TYPE_CHECKING:
     import mujoco

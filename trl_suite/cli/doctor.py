@@ -22,9 +22,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from trl_suite import policies
-from trl_suite.cli import machine
 from trl_suite.cli.arguments import add_command
-from trl_suite.util import compiled, libraries, resources
+from trl_suite.util import compiled, libraries, machine, resources
 
 BACKENDS = ('egl', 'osmesa', 'glfw')
 OK, NOTE, FAILED = 'ok', 'note', 'FAILED'

@@ -75,6 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         ),
         ('full length', f'{result["completion_rate"]:.0%} of the episodes'),
         ('falls', f'{result["falls"]:.0%} of the episodes'),
+        ('made with', f'MuJoCo {result["mujoco"]} on {result["cpu"]}'),
     )
     print(spec.id)
     for name, text in lines:

@@ -71,9 +71,11 @@ def _check(arguments: argparse.Namespace) -> None:
         result = sequences.read(path)
         notes = sequences.departures(result)
         comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
+        given = [name for name in sequences.results.MADE_WITH if name in result]
+        made = ''.join(f', {name} {result[name]}' for name in given)
         line = (
             f'{path}: {result["learner"]}, {result["sequence"]}, budget {result["budget"]}, seed '
-            f'{result["seed"]}: {comparable}'
+            f'{result["seed"]}{made}: {comparable}'
         )
         print(program.printable(line))
 

@@ -10,6 +10,7 @@ import numpy as np
 
 import trl_suite
 from trl_suite.tasks.task import Task
+from trl_suite.util import machine
 from trl_suite.util.digest import digest
 
 Signature = dict[str, tuple[str, str]]
@@ -42,7 +43,8 @@ def signature(task: Task, kind: str) -> Signature:
       kind: of the environment, since each has states of its own.
     """
     versions = f'{kind} of trl_suite {trl_suite.__version__} with MuJoCo {mujoco.__version__}'
-    parts = {'environment': (versions, versions), **task.made_of}
+    # The label names the class of CPU, on which a continuation is exact; on others it is valid, too.
+    parts = {'environment': (f'{versions} on {machine.cpu_class()}', versions), **task.made_of}
     found = {name: (label, digest(part, _LABELS)) for name, (label, part) in parts.items()}
     model = task.world.models[0]
     fields = [getattr(of, name) for of in (model, model.opt) for name in _FIELDS[type(of)]]

@@ -28,7 +28,8 @@ of observations, L the number of layers, c the number of inputs of the network: 
     bias_0...    float       (outputs,); the last layer is linear and has a outputs, or with choices
                              b, b + a or b + b a
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
-    info         U ()        a JSON object: how the policy was trained
+    info         U ()        a JSON object: how the policy was trained; 'mujoco' and 'cpu' say with what
+                             version and on what class of processor
 
 and, if the policy maps left stance to right stance by reflection (see `trl_suite.policies.mirror`):
 

@@ -3,6 +3,8 @@
 A result is a dict, written as JSON:
 
 * 'format': `FORMAT`; 'trl_suite': version of the package; 'learner': module and class.
+* 'mujoco': version of the engine; 'cpu': class of the processor, or of several, if the run was
+  resumed on another. Results without these two are valid.
 * The settings: 'sequence', 'ids' (T), 'budget' (samples per stage), 'episodes' (per test and task),
   'seed'.
 * 'initial': scores before any training, (T,); 'scores': R, (T, T), one row per stage.
@@ -35,6 +37,7 @@ SETTINGS = {  # with their types
     'learner': str, 'sequence': str, 'ids': list, 'budget': int, 'episodes': int, 'seed': int,
 }  # fmt: skip
 ROWS = ('scores', 'samples', 'curves', 'seconds')  # lists with one entry per stage
+MADE_WITH = ('mujoco', 'cpu')
 FIELDS = ('format', 'trl_suite', *SETTINGS, 'initial', *ROWS, 'digest')
 
 
@@ -76,11 +79,11 @@ def check(result: Any, complete: bool = True) -> None:
     """
     if not isinstance(result, dict):
         raise ValueError(f'a {type(result).__name__}; expected an object with {", ".join(FIELDS)}')
-    known = (*FIELDS, 'metrics')
+    known = (*FIELDS, 'metrics', *MADE_WITH)
     for name in result:
         if name not in known:
             raise ValueError(errors.unknown('field', name, known))
-    for name in known if complete else FIELDS:
+    for name in (*FIELDS, 'metrics') if complete else FIELDS:
         if name not in result:
             hint = '; the run has not ended' if name == 'metrics' else ''
             raise ValueError(f'{name} is missing{hint}')
@@ -88,6 +91,8 @@ def check(result: Any, complete: bool = True) -> None:
         raise ValueError(f'format is {result["format"]!r}; expected {FORMAT!r}')
     for name, kind in SETTINGS.items():
         errors.check_kind(name, result[name], kind)
+    for name in MADE_WITH:
+        errors.check_kind(name, result.get(name, ''), str)
     if not isinstance(result['ids'], list):
         raise ValueError(f'ids is {result["ids"]!r}; expected a list of strings')
     for name, least in (('budget', 1), ('episodes', 1), ('seed', 0)):

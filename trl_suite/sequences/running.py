@@ -19,7 +19,7 @@ from trl_suite.sequences import results
 from trl_suite.sequences.catalogue import BUDGETS, EPISODES, Sequence, get, test_seeds
 from trl_suite.sequences.metrics import metrics
 from trl_suite.sequences.stage import Stage
-from trl_suite.util import errors, files
+from trl_suite.util import errors, files, machine
 
 SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
 
@@ -134,7 +134,7 @@ def run(
         raise TypeError(f'learner is a {kind.__name__}; expected the methods train and policy')
     path = files.check_path(path, ('.json',))
     result: dict[str, Any] = {
-        'format': results.FORMAT, 'trl_suite': trl_suite.__version__,
+        'format': results.FORMAT, 'trl_suite': trl_suite.__version__, **machine.made_with(),
         'learner': f'{kind.__module__}:{kind.__qualname__}', 'sequence': sequence.name,
         'ids': list(sequence.ids), 'budget': int(budget), 'episodes': int(episodes),
         'seed': int(seed), 'initial': [], **{name: [] for name in results.ROWS},
@@ -179,8 +179,8 @@ def run(
 def _resumed(path: pathlib.Path, expected: dict[str, Any], learner: Learner) -> dict[str, Any]:
     """Returns the result so far, and restores the learner if the run has not ended."""
     result = results.read(path, complete=False)
-    for name in results.SETTINGS:
-        if result[name] != expected[name]:
+    for name in (*results.SETTINGS, 'mujoco'):
+        if result.get(name, expected[name]) != expected[name]:
             raise ValueError(
                 f'{path} holds a run with another {name}: {result[name]}; expected {expected[name]}'
             )
@@ -192,6 +192,8 @@ def _resumed(path: pathlib.Path, expected: dict[str, Any], learner: Learner) -> 
                 'cannot resume: it has no methods save and load; remove the file to start again'
             )
         learner.load(_state(path, done))
+    if done < stages and 'cpu' in result:
+        result['cpu'] = ', '.join(dict.fromkeys([*result['cpu'].split(', '), expected['cpu']]))
     return result
 
 

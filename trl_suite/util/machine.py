@@ -1,7 +1,8 @@
-"""The machine: processor, usable cores, versions."""
+"""The machine: processor and its class, usable cores, versions."""
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import math
 import os
@@ -9,6 +10,7 @@ import pathlib
 import platform
 
 PACKAGES = ('mujoco', 'dm-control', 'numpy')
+_VECTORS = {'avx512f': 'AVX-512', 'avx2': 'AVX2'}  # the widest first, by LLVM's names
 _QUOTA = pathlib.Path('/sys/fs/cgroup/cpu.max')  # microseconds, or max; period
 
 
@@ -33,6 +35,27 @@ def processor() -> str:
         lines = []
     names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
     return (names or [platform.processor()])[0] or platform.machine()
+
+
+@functools.cache
+def cpu_class() -> str:
+    """Returns architecture and widest vector instructions of the processor, e.g. 'x86_64 AVX-512'.
+
+    NumPy and its BLAS choose functions by these, which may differ in the last bits of their results.
+    """
+    from llvmlite import binding
+
+    has = binding.get_host_cpu_features()
+    widest = next((name for feature, name in _VECTORS.items() if has.get(feature)), '')
+    return f'{platform.machine()} {widest}'.strip()
+
+
+def made_with() -> dict[str, str]:
+    """Returns what bits of results depend on besides the suite: 'mujoco' (version), 'cpu' (class).
+
+    Policies, results of sequences and of evaluations hold both, and so does a saved state.
+    """
+    return {'mujoco': version('mujoco') or '', 'cpu': cpu_class()}
 
 
 def version(package: str) -> str | None:
