@@ -5,6 +5,8 @@ import os
 import signal
 import socket
 import types
+import urllib.error
+import urllib.request
 import warnings
 from unittest import mock
 
@@ -15,6 +17,7 @@ from absl.testing import absltest, parameterized
 from trl_suite import suite
 from trl_suite.cli import view
 from trl_suite.environments.environment import Environment
+from trl_suite.util import notices
 from trl_suite.viewing import browser, playback
 
 GAPS = cli_test.GAPS
@@ -92,6 +95,39 @@ class CommandTest(cli_test.CommandTest):
         self.assertRegex(out, r'^open http://127.0.0.1:\d+\S* in a web browser; press Ctrl')
         with self.assertRaises(ConnectionRefusedError):
             socket.create_connection(('127.0.0.1', viewers[0]._server.get_port())).close()
+
+    @parameterized.parameters((ValueError, 2), (KeyboardInterrupt, 130))
+    def test_the_address_answers_while_the_environment_is_loaded(self, error, status):
+        seen = []
+
+        def load(viewer, *_):
+            with urllib.request.urlopen(viewer.url) as page:
+                seen.append(page.status)
+            with self.assertRaises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(viewer.url[:-1])
+            seen.extend([refused.exception.code, viewer._panel._status.content, viewer])
+            notices._say('compiling')
+            seen.append(viewer._panel._status.content)
+            raise error('stop')
+
+        before = list(notices.listeners)
+        with mock.patch.object(browser.Browser, '_load', load):
+            found, out, _ = cli_test.run('view', GAPS, '--browser', '--port', '18700')
+        self.assertEqual((found, *seen[:2]), (status, 200, 403))
+        self.assertIn(GAPS, seen[2])
+        self.assertIn('compiling', seen[4])
+        self.assertStartsWith(out, f'open {seen[3].url} in a web browser')
+        self.assertEqual(notices.listeners, before)
+        with self.assertRaises(ConnectionRefusedError):  # the server has ended
+            socket.create_connection(('127.0.0.1', seen[3]._server.get_port())).close()
+
+    @parameterized.parameters(
+        ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
+        ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
+        ('no such file', GAPS, '--policy', 'none.npz'),
+    )
+    def test_no_address_is_printed_for_unknown_names(self, message, *arguments):
+        self.assert_refused(message, 'view', *arguments, '--browser')
 
     def test_a_missing_screen_is_an_error(self):
         nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}

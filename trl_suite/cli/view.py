@@ -19,6 +19,7 @@ from trl_suite.environments import named_policies as acting
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
+    from trl_suite.viewing.browser import Browser
 
 INSTEAD = 'use --browser to show it in a web browser, on this or another machine'
 
@@ -74,12 +75,15 @@ def run(arguments: argparse.Namespace) -> None:
 
 def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
     """Serves web browsers until an interrupt."""
-    viewer = engine.load('trl_suite.viewing.browser').Browser(
-        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options
-    )
+    engine.load('trl_suite.viewing.browser').Browser(
+        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options,
+        opened=_tell,
+    ).run()  # fmt: skip
+
+
+def _tell(viewer: Browser) -> None:
     elsewhere = f', or {viewer.other_url} on another machine' if viewer.other_url else ''
     print(f'open {viewer.url} in a web browser{elsewhere}; press Ctrl+C to stop', flush=True)
-    viewer.run()
 
 
 def check_screen() -> None:

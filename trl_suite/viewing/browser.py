@@ -69,8 +69,11 @@ class Browser:
         host: str = HOST,
         port: int = PORT,
         task_kwargs: Mapping[str, Any] | None = None,
+        opened: Callable[[Browser], object] = lambda viewer: None,
     ) -> None:
         """Opens the viewer; the simulation runs in `run` or after `start`.
+
+        The page can be opened while the environment is loaded and compiled, and says so.
 
         Args:
           spec: an id, an alias, or a result of `suite.combine`.
@@ -80,6 +83,7 @@ class Browser:
             network.
           port: the first port to try, then the following ones.
           task_kwargs: options of the task, also of environments that are chosen later.
+          opened: called when the addresses are known, before the environment is loaded.
 
         Raises:
           ValueError: an unknown id, policy, option or port, or a policy that does not fit.
@@ -95,9 +99,11 @@ class Browser:
         self._files: dict[str, policies.Policy] = {}  # what .npz files held, by name
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
-        loaded = self._load(
-            spec, policy
-        )  # before the server is started, as an error would leave it running
+        spec = suite.find(spec) if isinstance(spec, str) else spec
+        if policy.endswith('.npz'):
+            self._files[policy] = policies.load(policy)
+        elif policy != 'best':
+            named_policies.check(policy)
         token = secrets.token_hex(16)
         self._server = web_server.start_server(
             host, port, token, lambda sentence: self._ask(lambda: self._panel.tell(sentence))
@@ -105,8 +111,17 @@ class Browser:
         place = f'{self._server.get_port()}/{token}'
         self.url = f'http://{HOST if host == EVERY else host}:{place}'
         self.other_url = f'http://{socket.gethostname()}:{place}' if host == EVERY else ''
-        self._panel = panel.Panel(self._server, self)
-        self._show(loaded)
+        notices.listeners.append(self._loading)
+        try:
+            self._panel = panel.Panel(self._server, self)
+            self._loading(spec.id)
+            opened(self)
+            self._show(self._load(spec, policy))
+        except BaseException:  # an interrupt, too; else the server would run on
+            web_server.stop_server(self._server)
+            raise
+        finally:
+            notices.listeners.remove(self._loading)
 
     def run(self) -> None:
         """Runs the simulation until `stop` or an interrupt, which is raised; closes the viewer."""
@@ -206,7 +221,7 @@ class Browser:
         """Shows another environment, with its best policy."""
 
         def choose() -> None:
-            self._panel.report({'loading': str(spec)}, self.playing)
+            self._loading(str(spec))
             self._show(self._load(spec, 'best'))
 
         self._ask(choose)
@@ -267,6 +282,9 @@ class Browser:
             except Exception as error:  # whatever is asked, the viewer goes on
                 self._panel.tell(program.in_one_line(error))
                 self._panel.show(self._loaded, self.session)  # what was chosen is not shown
+
+    def _loading(self, text: str) -> None:
+        self._panel.report({'loading': text}, self.playing)
 
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
         spec = suite.find(spec) if isinstance(spec, str) else spec
