@@ -1,5 +1,6 @@
 """Tests of the package: pins, what importing costs, and a wheel far from the checkout."""
 
+import ast
 import os
 import pathlib
 import re
@@ -16,6 +17,7 @@ import zipfile
 import pytest
 from absl.testing import absltest
 from helpers import besides_notices
+from packaging.requirements import Requirement
 
 import trl_suite
 from trl_suite.util import libraries
@@ -46,6 +48,24 @@ class PinTest(absltest.TestCase):
         # ('MjModel' object has no attribute 'flex_vertedge'), so an unpinned install is broken.
         self.assertIn("'mujoco>=3.17,<4'", required)
         self.assertIn("'dm-control>=1.0.50", required.replace('"', "'"))
+
+    def test_constraints_fix_what_is_required(self):
+        setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
+        listed = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
+        texts = re.findall(r'^ +([\'"].*[\'"]),$', listed, re.MULTILINE)
+        required = [Requirement(ast.literal_eval(text)) for text in texts]
+        self.assertGreater(len(required), 10)
+        lines = (CHECKOUT / 'constraints.txt').read_text(encoding='utf-8').splitlines()[1:]
+        fixed = [(each.name, each) for each in map(Requirement, lines)]
+        for requirement in required:
+            for version in ('3.11', '3.12', '3.13'):
+                found = [
+                    str(each.specifier).removeprefix('==') for name, each in fixed
+                    if name == requirement.name
+                    and (each.marker is None or each.marker.evaluate({'python_version': version}))
+                ]  # fmt: skip
+                self.assertLen(found, 1, (requirement.name, version))
+                self.assertIn(found[0], requirement.specifier)
 
     def test_pages_install_the_version_of_dm_control_that_messages_name(self):
         names = 'README.md', 'CONTRIBUTING.md', '.ci/run', '.ci/newest_engine'
