@@ -18,7 +18,7 @@ from helpers import FolderTest, advance, assert_goes_on, assert_rows_are_singles
 
 from trl_suite import suite
 from trl_suite.engine import PhysicsWorld, light_model, variation
-from trl_suite.tasks.disturbances import Disturbed, sensors, worlds
+from trl_suite.tasks.disturbances import Disturbed, WorldConfig, sensors, worlds
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -270,12 +270,12 @@ class WorldTest(parameterized.TestCase):
         self.assertLen(found, 4)
 
     def test_presets_are_extended_and_reduced(self):
-        config = worlds.configure({'preset': 'robot', 'friction': 0.3, 'push': None})
+        config = WorldConfig.parse('randomize', {'preset': 'robot', 'friction': 0.3, 'push': None})
         self.assertEqual(config.friction, (0.3, 0.3))
         self.assertIsNone(config.push)
-        self.assertEqual(config.link_mass, worlds.configure('robot').link_mass)
+        self.assertEqual(config.link_mass, WorldConfig.parse('randomize', 'robot').link_mass)
         for name in worlds.PRESETS:
-            self.assertIsNotNone(worlds.configure(name).push)
+            self.assertIsNotNone(WorldConfig.parse('randomize', name).push)
             sensors.configure(name)
 
     def test_nothing_asked_for_is_the_plain_task(self):
@@ -652,21 +652,21 @@ class RefusalTest(parameterized.TestCase):
         ({'frction': 1}, "did you mean 'friction'"),
         ('robust', "did you mean 'robot'"),
         ({'preset': 'hash'}, "did you mean 'harsh'"),
-        (3, "expected 'mild', 'robot', 'harsh', or a dict"),
-        ({'friction': -0.1}, 'friction is -0.1; expected a number at least 0'),
+        (3, "expected 'mild', 'robot', 'harsh', a dict of options, or WorldConfig"),
+        ({'friction': -0.1}, 'friction is -0.1; expected .* a number .* from 0 to 10'),
         ({'friction': (1.2, 0.5)}, 'friction is .*lower and an upper'),
         ({'friction': (0.1, 0.2, 0.3)}, 'lower and an upper'),
-        ({'mass': 0}, 'mass is 0; .* at least 0.01'),
-        ({'gravity': 1e4}, 'gravity is .* at most 100'),
+        ({'mass': 0}, 'mass is 0; .* from 0.01 to 100'),
+        ({'gravity': 1e4}, 'gravity is .* to 100'),
         ({'slope': 2.0}, 'slope is 2.0; .* rad'),
         ({'slope_direction': 1.0}, 'slope_direction has no effect without slope'),
         ({'slope': 0.1, 'slope_direction': 1.0}, 'three-dimensional'),
         ({'com_offset': 5}, 'com_offset is 5; .* m'),
-        ({'friction': 'much'}, 'friction is .much.; expected a number'),
-        ({'friction': ''}, 'friction is ..; expected a number'),
+        ({'friction': 'much'}, 'friction is .much.; expected None or a number'),
+        ({'friction': ''}, 'friction is ..; expected None or a number'),
         ({'push': {}}, 'neither force and speed'),
         ({'push': {'force': 1, 'speed': 1}}, 'both force and speed'),
-        ({'push': 150}, "push is 150; expected a mapping such as {'force': 150}"),
+        ({'push': 150}, 'push is 150; expected a dict of options, or PushConfig'),
         ({'push': {'force': 1, 'body': 'rooot'}}, 'unknown link in push: body'),
         ({'push': {'force': 1, 'duration': 0}}, 'duration is 0; .* s'),
         ({'push': {'force': np.inf}}, 'force is inf'),

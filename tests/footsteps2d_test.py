@@ -403,10 +403,10 @@ class HelperTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'plans': {'length': (0.6, 0.5)}}, r'length is \(0.6, 0.5\)'),
-        ({'plans': {'length': 0.5}}, 'length is 0.5'),
+        ({'plans': {'length': -0.5}}, 'length is -0.5'),
         ({'plans': {'change': 1.5}}, 'change is 1.5'),
         ({'plans': {'width': (0.1, 0.2)}}, "unknown option of plans 'width'"),
-        ({'plans': 0.5}, 'plans is 0.5; expected StraightPlans'),
+        ({'plans': 0.5}, 'plans is 0.5; expected a dict of options, or StraightPlans'),
         ({'max_landing_error': 0}, 'max_landing_error is 0'), ({'max_landing_error': np.nan}, 'max_landing_error is nan'),
         ({'footstep_scale': -1}, 'footstep_scale is -1'),
         ({'footstep_scale': np.inf}, 'footstep_scale is inf'),

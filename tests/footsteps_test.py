@@ -817,7 +817,7 @@ class HelperTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'plans': {'length': (0.6, 0.5)}}, r'length is \(0.6, 0.5\)'),
-        ({'plans': {'length': 0.5}}, 'length is 0.5'),
+        ({'plans': {'length': -0.5}}, 'length is -0.5'),
         ({'plans': np.zeros((2, 2))}, r'plans is array\(\[\[0'),
         ({'plans': {'width': (-0.1, 0.2)}}, 'width is'),
         ({'plans': {'width': (0.1, np.inf)}}, 'width is'),
@@ -848,6 +848,8 @@ class HelperTest(parameterized.TestCase):
         self.assertIs(environment.task.plans, plans)
         with self.assertRaises(AttributeError):
             plans.turn = 1.0
+        plans = Plans.parse('plans', {'length': 0.5, 'width': np.array([0, 0.2])})
+        self.assertEqual((plans.length, plans.width.high), ((0.5, 0.5), 0.2))
 
     def test_characters_without_two_feet(self):
         with self.assertRaisesRegex(

@@ -100,7 +100,7 @@ def check_option(task_type, name, value, step):
     """An option is refused by its name, or the environment works with it."""
     type_ = TASK_TYPES[task_type]
     try:
-        type_.config.of(task_type, {name: value})
+        type_.config.parse(task_type, {name: value})
     except REFUSALS as error:
         assert name in str(error), f'{name}={value!r}: {error}'
         return

@@ -612,7 +612,7 @@ class OptionTest(parameterized.TestCase):
         ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
         ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
         ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
-        ({'start_noise': np.inf}, 'start_noise is inf'), ({'start_noise': 1e300}, 'at most 1, in rad'), ({'spawn': 'here'}, "'here'"),
+        ({'start_noise': np.inf}, 'start_noise is inf'), ({'start_noise': 1e300}, 'from 0 to 1, in rad'), ({'spawn': 'here'}, "'here'"),
         ({'terrain_observation': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
     )  # fmt: skip
     def test_options(self, options, message):

@@ -22,7 +22,7 @@ from trl_suite.actuation import series, strength_curves
 from trl_suite.actuation.strength_curves import Curve
 from trl_suite.characters.character import Character, CharacterSpec
 from trl_suite.engine import World, motors
-from trl_suite.util.options import Config, option
+from trl_suite.util.options import Config, Range, option
 
 NOISE_TIME = 0.02  # s; correlation time of the torque noise
 LONGEST_DELAY = 1000.0  # ms
@@ -69,8 +69,8 @@ class Actuators(Config):
         "factors of the torque limits by joint angle and direction: True for the character's own (bipeds: "
         "human legs), 'human', a JSON file, or a table of joint -> angle (rad), positive, negative",
     )
-    delay: float | Sequence[float] = option(
-        0.0,
+    delay: Range = option(
+        Range(0.0, 0.0),
         'time until a control takes effect, rounded to physics steps; or two bounds, between which it is '
         'drawn for each episode',
         unit='ms', at_least=0, at_most=LONGEST_DELAY,
@@ -99,8 +99,8 @@ class Actuators(Config):
         f'degree of freedom, with a correlation time of {NOISE_TIME:g} s',
         at_least=0, at_most=0.5,
     )  # fmt: skip
-    strength: float | Sequence[float] = option(
-        1.0,
+    strength: Range = option(
+        Range(1.0, 1.0),
         'factor of all torques of a motor or muscle, gains and limits included; or two bounds, between '
         'which it is drawn for each motor and episode',
         above=0, at_most=2,
@@ -110,44 +110,9 @@ class Actuators(Config):
         super().__post_init__()
         if self.torque_pose is False:
             self._set('torque_pose', None)
-        for name in ('delay', 'strength'):
-            self._set(name, _interval(name, getattr(self, name)))
         for name, needed in _REQUIRED.items():
             if not getattr(self, needed) and name in self.changed:
                 raise ValueError(f'{name} has no effect without {needed}; give both or none')
-
-    @classmethod
-    def parse(cls, value: Any) -> Actuators:
-        """Returns the actuators that a user gives: options by name, or `Actuators`.
-
-        Raises:
-          ValueError: another type, an unknown name, or an invalid value.
-        """
-        if isinstance(value, Actuators):
-            return value
-        if not isinstance(value, Mapping):
-            raise ValueError(f'actuators is {value!r}; expected a dict of options, or Actuators')
-        return cls.of('actuators', value)
-
-
-def _interval(name: str, value: float | Sequence[float]) -> float | tuple[float, float]:
-    """Returns a number, or two bounds in ascending order; equal ones become a number.
-
-    Raises:
-      ValueError: another number of values, or another order.
-    """
-    if np.ndim(value) == 0:
-        return float(value)  # type: ignore[arg-type]
-    bounds = tuple(float(each) for each in value)  # type: ignore[union-attr]
-    if len(bounds) != 2 or bounds[0] > bounds[1]:
-        raise ValueError(f'{name} is {value}; expected a number, or two bounds in ascending order')
-    return bounds[0] if bounds[0] == bounds[1] else (bounds[0], bounds[1])
-
-
-def bounds(value: float | Sequence[float]) -> tuple[float, float]:
-    """Returns lower and upper bound of a value of an option, which may be a number."""
-    low, high = value if isinstance(value, Sequence) else (value, value)
-    return low, high
 
 
 class Units:
@@ -326,8 +291,8 @@ def check(actuators: Actuators, actuation: str) -> None:
     for name, reason in NOT_FOR_MUSCLES.items():
         if actuation == 'muscle' and name in actuators.changed:
             raise ValueError(f'{name} is not an option of muscle control: {reason}')
-    if actuation == 'gait' and bounds(actuators.delay)[1] > GAIT_DELAY:
+    if actuation == 'gait' and actuators.delay.high > GAIT_DELAY:
         raise ValueError(
-            f'delay is {actuators.delay}; expected at most {GAIT_DELAY:g} ms for a gait, whose '
+            f'delay is {actuators.delay.high:g}; expected at most {GAIT_DELAY:g} ms for a gait, whose '
             'torques are computed from the state 600 times a second: it is unstable if they are late'
         )

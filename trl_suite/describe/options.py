@@ -12,7 +12,7 @@ from trl_suite.kinematics.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.disturbances import sensors, worlds
-from trl_suite.util.options import Config
+from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
 
 _EVERYWHERE = (
@@ -92,7 +92,7 @@ def table_of(config: type[Config], omitted: Collection[str] = ()) -> Table:
             continue
         data, limits = field.metadata, []
         for key in ('at_least', 'above', 'at_most', 'below'):
-            if (bound := data['bounds'][key]) is not None:
+            if (bound := data['bounds'].get(key)) is not None:
                 limits.append(f'{key.replace("_", " ")} {bound:.4g}')
         cells.append(
             (field.name, _shown(field.default), data['unit'], ', '.join(limits), data['meaning'])
@@ -123,6 +123,8 @@ def _presets(option: str, presets: Mapping[str, Any]) -> str:
 def _shown(value: Any) -> str:
     if value is None or value is inspect.Parameter.empty:
         return '-'
+    if isinstance(value, Range):
+        value = value.low if value.low == value.high else tuple(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     return repr(dict(value) if isinstance(value, Mapping) else value)

@@ -79,7 +79,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     disturbing = {name: merged.pop(name) for name in disturbances.OPTIONS if name in merged}
-    actuators = Actuators.parse(merged.pop('actuators', {}))
+    actuators = Actuators.parse('actuators', merged.pop('actuators', {}))
     realism.check(actuators, spec.actuation)
     type_, others = (
         task_type(spec),
@@ -98,7 +98,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
         }
         for name, default in policies_.items():
             merged[name] = _policy(name, merged.get(name, default))
-        config = config_type.of(spec.id, merged, others)
+        config = config_type.parse(spec.id, merged, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '

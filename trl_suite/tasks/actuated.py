@@ -56,7 +56,7 @@ class Actuated(Wrapper):
         model, actuators = world.models[0], self.actuators
         units = realism.Units(self._character, model)
         self._timestep = world.engine.timestep
-        longest = self._steps(realism.bounds(actuators.delay)[1])
+        longest = self._steps(actuators.delay.high)
         slots = longest // self.steps_per_call + 2 if longest else 0
         self.motors = world.set_motors(
             realism.limits(actuators, units, model, self._curves),
@@ -94,11 +94,9 @@ class Actuated(Wrapper):
         """Draws strengths, delay and noise at the start of an episode."""
         state, rng = self.motors, np.random.default_rng(seed)
         state.age[env_id] = state.given[env_id] = state.used[env_id] = 0
-        state.strength[env_id] = rng.uniform(
-            *realism.bounds(self.actuators.strength), state.strength.shape[1]
-        )
+        state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
         self._strength.apply(env_id, state.strength[env_id])
-        state.lag[env_id] = self._steps(rng.uniform(*realism.bounds(self.actuators.delay)))
+        state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
         self._delay[env_id] = 1000 * self._timestep * state.lag[env_id]
         state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
         self._streams.seed(env_id, seed.spawn(1)[0])

@@ -40,6 +40,14 @@ def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
     return f'unknown {kind} {name!r}; {hint}'
 
 
+def check_known(kind: str, choices: Iterable[str], *names: Any) -> None:
+    """Raises ValueError with the closest choices if a name is not one of them."""
+    known = [*choices]
+    for name in names:
+        if name not in known:
+            raise ValueError(unknown(kind, name, known))
+
+
 def _listed(names: list[str]) -> str:
     if len(names) <= MANY:
         return ', '.join(names)

@@ -2,23 +2,26 @@
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class HopConfig(Config):
-        height: float = option(0.3, 'height of a hop', unit='m', above=0)
+        height: Range = option(Range(0.3, 0.3), 'height of a hop', unit='m', at_least=0, at_most=2)
         side: str = option('left', 'leg that hops', choices=('left', 'right'))
 
-    HopConfig(height=0.5)
-    HopConfig.of('my environment', {'heigth': 0.5})  # ValueError; did you mean 'height'?
+    HopConfig(height=0.5).height  # Range(0.5, 0.5); height=(0.2, 0.5) is drawn between them
+    HopConfig.parse('my environment', {'heigth': 0.5})  # ValueError; did you mean 'height'?
     HopConfig.options()  # name, default, unit and meaning of each, for pages
 
 Constructors, `trl-suite info`, documentation pages and error messages read the same fields.
+`checked` applies the same rules to the arguments of functions.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import operator
+import types
 import typing
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple, Self
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -29,18 +32,32 @@ _COMPARISONS = {
 }  # fmt: skip
 
 
+class Range(NamedTuple):
+    """Bounds between which a value is drawn; an option also takes a number, which is both."""
+
+    low: float
+    high: float
+
+
+_UNFIT = object()  # stands for a value of another type
+_TYPES: dict[Any, Any] = {bool: (bool, np.bool_), str: str, types.NoneType: types.NoneType}
+_SEQUENCES = (list, Sequence, Collection)
+_WORDS: dict[object, tuple[str, str]] = {  # kinds of values, singular and plural
+    bool: ('True or False', 'bools'), int: ('a whole number', 'whole numbers'),
+    float: ('a number', 'numbers'), str: ('a string', 'strings'), types.NoneType: ('None', 'None'),
+    Range: ('a number or a lower and an upper bound', 'ranges'),
+}  # fmt: skip
+
+
 def option(
     default: Any,
     meaning: str,
     *,
     unit: str = '',
-    at_least: float | None = None,
-    at_most: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
     choices: Collection[str] = (),
     actuation: str | None = None,
     policy: bool = False,
+    **bounds: float,
 ) -> Any:
     """Returns a dataclass field for an option.
 
@@ -48,12 +65,11 @@ def option(
       default: default value.
       meaning: one line for `trl-suite info` and the pages.
       unit: unit of the value, if it is a number.
-      at_least, at_most, above, below: bounds of every number in the value.
       choices: the allowed strings, for the value or its elements.
       actuation: the only actuation model that has the option.
       policy: whether the id of an environment may be given for the policy that is shipped for it.
+      **bounds: at_least, at_most, above or below, of every number in the value.
     """
-    bounds = {'at_least': at_least, 'at_most': at_most, 'above': above, 'below': below}
     metadata = {
         'meaning': meaning, 'unit': unit, 'bounds': bounds, 'choices': tuple(choices),
         'actuation': actuation, 'policy': policy,
@@ -76,36 +92,55 @@ class Option(NamedTuple):
 class Config:
     """Base class of options; a subclass has a field, made by `option`, for each of them.
 
+    An option whose type is a `Range` or another `Config` also takes a number, or a dict of options;
+    of a `Config` that is not optional, None stands for the defaults.
+
+    Attributes:
+      presets: values of options by the name of a preset; a class that has some has an option `preset`.
+
     Raises:
       ValueError: a value of another type or out of range; the message has the name of the option
         and what was expected.
     """
 
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = types.MappingProxyType({})
+
     def __post_init__(self) -> None:
-        hints = typing.get_type_hints(type(self))
+        kinds = typing.get_type_hints(type(self))
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            errors.check_kind(field.name, value, hints[field.name])
-            _check_choices(field.name, value, field.metadata['choices'])
-            _check_bounds(field.name, value, field.metadata)
+            name, data = field.name, field.metadata
+            limits = data['unit'], data['choices']
+            self._set(
+                name, checked(name, getattr(self, name), kinds[name], *limits, **data['bounds'])
+            )
 
     @classmethod
-    def of(cls, owner: str, given: Mapping[str, Any], others: Iterable[str] = ()) -> Self:
-        """Makes a config from values by name.
+    def parse(cls, owner: str, given: Any, others: Iterable[str] = ()) -> Self:
+        """Makes a config from what a user gives.
 
         Args:
           owner: name of the owner of the options, for messages.
-          given: values that differ from the defaults.
+          given: values that differ from the defaults, or from those of a preset, by name; the name
+            of a preset; or a config.
           others: further valid names that are handled elsewhere, for messages.
 
         Raises:
-          ValueError: an unknown name, or an invalid value.
+          ValueError: anything else, an unknown name, or an invalid value.
         """
+        if isinstance(given, cls):
+            return given
+        if isinstance(given, str) and cls.presets:
+            given = {'preset': given}
+        if not isinstance(given, Mapping):
+            names = ''.join(f'{name!r}, ' for name in cls.presets)
+            raise ValueError(
+                f'{owner} is {given!r}; expected {names}a dict of options, or {cls.__name__}'
+            )
         known = [field.name for field in dataclasses.fields(cls)]
-        for name in given:
-            if name not in known:
-                raise ValueError(errors.unknown(f'option of {owner}', name, [*known, *others]))
-        return cls(**given)
+        if not {*known}.issuperset(given):
+            errors.check_known(f'option of {owner}', [*known, *others], *given)
+        preset = given.get('preset')
+        return cls(**{**(cls.presets.get(preset, {}) if isinstance(preset, str) else {}), **given})
 
     @classmethod
     def options(cls) -> list[Option]:
@@ -132,26 +167,93 @@ class Config:
         object.__setattr__(self, name, value)
 
 
-def _check_choices(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    if not choices or value is None:
-        return
-    for each in (value,) if isinstance(value, str) else value:
-        if each not in choices:
-            raise ValueError(errors.unknown(name, each, choices))
+def checked(
+    name: str,
+    value: Any,
+    kind: Any,
+    unit: str = '',
+    choices: Collection[str] = (),
+    /,
+    **bounds: float,
+) -> Any:
+    """Returns a value in its normal form: a `Range`, a `Config`, an integer, a tuple of a sequence.
+
+    Args:
+      name: name of the option or argument.
+      value: its value. Numbers must be finite; any without a fractional part is a whole number.
+      kind: its type annotation; any value is valid for types that this function does not know.
+      unit: unit of numbers, for the message.
+      choices: the allowed strings, for the value or its elements.
+      **bounds: at_least, at_most, above or below, of every number in the value.
+
+    Raises:
+      ValueError: the value has another type or is out of range; the message has the name and what
+        was expected.
+    """
+    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    kinds = typing.get_args(kind) if union else (kind,)
+    if value is None and types.NoneType in kinds:
+        return None
+    found: Any
+    forms = (_normal(name, value, each) for each in kinds)
+    found = next((form for form in forms if form is not _UNFIT), _UNFIT)
+    if found is not _UNFIT and choices:
+        errors.check_known(name, choices, *((found,) if isinstance(found, str) else found))
+    if found is _UNFIT or (bounds and not _is_within(found, bounds)):
+        words = dict.fromkeys(_words(each) for each in sorted(kinds, key=_is_numeric))
+        expected = ' or '.join(words) + _limits(bounds) + (f', in {unit}' if unit else '')
+        raise ValueError(f'{name} is {value!r}; expected {expected}')
+    return found
 
 
-def _check_bounds(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    bounds: dict[str, float | None] = metadata['bounds']
-    if value is None or set(bounds.values()) == {None}:
-        return
-    numbers = np.ravel(np.asarray(value, float))
-    good = np.isfinite(numbers) & (len(numbers) > 0)
-    words = []
-    for key, bound in bounds.items():
-        if bound is not None:
-            good &= _COMPARISONS[key](numbers, bound)
-            words.append(f'{key.replace("_", " ")} {bound:g}')
-    if not len(numbers) or not good.all():
-        what = 'numbers' if np.ndim(value) else 'a number'
-        unit = f', in {metadata["unit"]}' if metadata['unit'] else ''
-        raise ValueError(f'{name} is {value}; expected {what} {" and ".join(words)}{unit}')
+def _normal(name: str, value: Any, kind: Any) -> Any:
+    """Returns a value in the normal form of a kind, or `_UNFIT`."""
+    if kind in (int, float):
+        fits = errors.is_number(value) and math.isfinite(value) and not (kind is int and value % 1)
+        return _UNFIT if not fits else int(value) if kind is int else value
+    if kind in _TYPES:
+        return value if isinstance(value, _TYPES[kind]) else _UNFIT
+    if kind is Range:
+        pair = (value, value) if errors.is_number(value) else _sequence(name, value, float)
+        fits = pair is not _UNFIT and len(pair) == 2 and -math.inf < pair[0] <= pair[1] < math.inf
+        return Range(*map(float, pair)) if fits else _UNFIT
+    if isinstance(kind, type) and issubclass(kind, Config):
+        return kind.parse(name, {} if value is None else value)
+    if typing.get_origin(kind) in _SEQUENCES:
+        return _sequence(name, value, *typing.get_args(kind))
+    return value
+
+
+def _sequence(name: str, value: Any, kind: Any) -> Any:
+    if isinstance(value, (str, bytes, Mapping)):  # their elements are not the intended values
+        return _UNFIT
+    try:
+        found = tuple(_normal(name, each, kind) for each in value)
+    except TypeError:  # not iterable
+        return _UNFIT
+    return _UNFIT if any(each is _UNFIT for each in found) else found
+
+
+def _is_within(value: Any, bounds: Mapping[str, float]) -> bool:
+    found = np.ravel(np.asarray(value, float))
+    return len(found) > 0 and all(_COMPARISONS[k](found, b).all() for k, b in bounds.items())
+
+
+def _is_numeric(kind: Any) -> bool:
+    return kind in (int, float, Range) or any(map(_is_numeric, typing.get_args(kind)))
+
+
+def _words(kind: Any, many: bool = False) -> str:
+    if kind in _WORDS:
+        return _WORDS[kind][many]
+    inner = ''.join(f' of {_words(each, many=True)}' for each in typing.get_args(kind)[:1])
+    return f'lists{inner}' if many else f'a list{inner}'
+
+
+def _limits(bounds: Mapping[str, float]) -> str:
+    """Returns bounds in words."""
+    text = {key: str(b) if isinstance(b, int) else f'{b:g}' for key, b in bounds.items()}
+    if [*text] == ['at_least', 'at_most']:
+        return ' from {at_least} to {at_most}'.format(**text)
+    words = ' and '.join(f'{key.replace("_", " ")} {number}' for key, number in text.items())
+    return f' {words}' if words else ''

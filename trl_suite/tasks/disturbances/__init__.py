@@ -15,8 +15,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.tasks.disturbances import sensors
 from trl_suite.tasks.disturbances.task import Disturbed
+from trl_suite.tasks.disturbances.worlds import WorldConfig
 from trl_suite.tasks.task import Task
 
 OPTIONS = ('randomize', 'sensors')
@@ -27,12 +28,16 @@ def disturb(task: Task, options: Mapping[str, Any]) -> Task:
 
     Args:
       task: any task that no other environment uses.
-      options: values of `OPTIONS`, see `worlds.configure` and `sensors.configure`.
+      options: values of `OPTIONS`: None; the name of a preset; options by name, in which 'preset' may
+        name a preset that the others change, None removing one; or a config.
 
     Raises:
       ValueError: unknown names, values out of range, or options that contradict each other or that
         the task cannot have.
     """
-    world = worlds.configure(options.get('randomize'))
-    sensor = sensors.configure(options.get('sensors'))
+    world, sensor = options.get('randomize'), sensors.configure(options.get('sensors'))
+    if world is None or (isinstance(world, Mapping) and not world):
+        world = None
+    else:
+        world = WorldConfig.parse('randomize', world)
     return task if world is None and sensor is None else Disturbed(task, world, sensor)

@@ -8,146 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from trl_suite.engine.variation import Properties
 from trl_suite.util import errors
-from trl_suite.util.options import Config, option
-
-Range = float | Sequence[float] | None
-_EVEN = 'uniform between two bounds, or a number: constant'
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PushConfig(Config):
-    """Options of pushes: horizontal forces on a link, at its centre of mass."""
-
-    force: Range = option(None, 'force', unit='N', at_least=0, at_most=1e6)
-    speed: Range = option(
-        None,
-        "impulse over the character's nominal mass, instead of a force: the change of velocity of a "
-        'free body',
-        unit='m/s', at_least=0, at_most=100,
-    )  # fmt: skip
-    duration: float | Sequence[float] = option(
-        0.2, 'duration', unit='s', at_least=0.001, at_most=1000
-    )
-    interval: float | Sequence[float] = option(
-        (2.0, 4.0),
-        'time from the end of a push, or the start of the episode, to the next push',
-        unit='s', at_least=0, at_most=1e6,
-    )  # fmt: skip
-    direction: float | Sequence[float] = option(
-        (-math.pi, math.pi),
-        'direction, to the left of +x; planar characters are pushed along +x if its cosine is positive, '
-        'otherwise along -x',
-        unit='rad', at_least=-2 * math.pi, at_most=2 * math.pi,
-    )  # fmt: skip
-    body: str | None = option(None, 'link that is pushed; by default the root')
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.force is None) == (self.speed is None):
-            given = 'neither' if self.force is None else 'both'
-            raise ValueError(f'push has {given} force and speed; expected one of them')
-        for name in ('force', 'speed', 'duration', 'interval', 'direction'):
-            value = getattr(self, name)
-            if value is not None:
-                self._set(name, bounds(f'push: {name}', value))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WorldConfig(Config):
-    """Options of worlds; a property that is None is not varied."""
-
-    preset: str | None = option(
-        None, 'preset that the other options change', choices=('mild', 'robot', 'harsh')
-    )
-    friction: Range = option(
-        None, 'coefficient of sliding friction of all contacts; 0.81 otherwise', at_least=0, at_most=10
-    )  # fmt: skip
-    mass: Range = option(
-        None, 'factor of mass and inertia of all links', at_least=0.01, at_most=100
-    )
-    link_mass: Range = option(
-        None,
-        'factor of mass and inertia, drawn for each link; in addition to mass',
-        at_least=0.01,
-        at_most=100,
-    )
-    inertia: Range = option(
-        None,
-        'factor of the inertia of all links about their centres of mass; in addition to mass',
-        at_least=0.01,
-        at_most=100,
-    )
-    com_offset: Range = option(
-        None,
-        "displacement of the root link's centre of mass, in a random direction",
-        unit='m',
-        at_least=0,
-        at_most=1,
-    )
-    damping: Range = option(
-        None,
-        'factor of the passive damping of joints; the joints of gaits have none',
-        at_least=0,
-        at_most=1000,
-    )
-    gravity: Range = option(
-        None, 'magnitude of gravity; 9.8 otherwise', unit='m/s^2', at_least=0, at_most=100
-    )
-    slope: Range = option(
-        None,
-        'angle by which the whole ground is tilted: gravity is rotated, and positions, headings and heights '
-        'are relative to the ground',
-        unit='rad', at_least=-1.5, at_most=1.5,
-    )  # fmt: skip
-    slope_direction: Range = option(
-        None,
-        'direction of ascent of the slope, to the left of +x, in three dimensions; by default 0',
-        unit='rad',
-        at_least=-2 * math.pi,
-        at_most=2 * math.pi,
-    )
-    contact_depth: Range = option(
-        None,
-        'depth over which contacts become stiff, starting from nothing; otherwise they are stiff from the '
-        'first touch',
-        unit='m', at_least=1e-4, at_most=0.1,
-    )  # fmt: skip
-    contact_time: Range = option(
-        None,
-        'time constant of contacts; 0.005 otherwise, and at least two physics steps',
-        unit='s',
-        at_least=1e-3,
-        at_most=1,
-    )
-    push: Any = option(None, 'forces on the character: a mapping of options of pushes')
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in Properties._fields:
-            value = getattr(self, name)
-            if value is not None:
-                self._set(name, bounds(name, value))
-        if self.slope_direction is not None and self.slope is None:
-            raise ValueError('slope_direction has no effect without slope; give both')
-        if self.push is not None and not isinstance(self.push, PushConfig):
-            if not isinstance(self.push, Mapping):
-                raise ValueError(
-                    f"push is {self.push!r}; expected a mapping such as {{'force': 150}}"
-                )
-            self._set('push', PushConfig.of('push', self.push))
-
-    @property
-    def varied(self) -> tuple[str, ...]:
-        """Names of the properties that are varied."""
-        return tuple(name for name in Properties._fields if getattr(self, name) is not None)
-
+from trl_suite.util.options import Config, Range, option
 
 # Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
 # robots are trained: friction 0.5 to 1.25 and changes of velocity of up to 1 m/s every 15 s in
@@ -174,17 +42,118 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 
 
-def configure(value: Any) -> WorldConfig | None:
-    """Returns the options of worlds.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PushConfig(Config):
+    """Options of pushes: horizontal forces on a link, at its centre of mass."""
 
-    Args:
-      value: None; the name of a preset; a mapping of options by name, in which 'preset' may name a
-        preset that the other options change, None removing one; or a `WorldConfig`.
+    force: Range | None = option(None, 'force', unit='N', at_least=0, at_most=1e6)
+    speed: Range | None = option(
+        None,
+        "impulse over the character's nominal mass, instead of a force: the change of velocity of a "
+        'free body',
+        unit='m/s', at_least=0, at_most=100,
+    )  # fmt: skip
+    duration: Range = option(Range(0.2, 0.2), 'duration', unit='s', at_least=0.001, at_most=1000)
+    interval: Range = option(
+        Range(2.0, 4.0),
+        'time from the end of a push, or the start of the episode, to the next push',
+        unit='s', at_least=0, at_most=1e6,
+    )  # fmt: skip
+    direction: Range = option(
+        Range(-math.pi, math.pi),
+        'direction, to the left of +x; planar characters are pushed along +x if its cosine is positive, '
+        'otherwise along -x',
+        unit='rad', at_least=-2 * math.pi, at_most=2 * math.pi,
+    )  # fmt: skip
+    body: str | None = option(None, 'link that is pushed; by default the root')
 
-    Raises:
-      ValueError: anything else, unknown names, or values out of range.
-    """
-    return preset_and_options('randomize', value, WorldConfig, PRESETS)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.force is None) == (self.speed is None):
+            given = 'neither' if self.force is None else 'both'
+            raise ValueError(f'push has {given} force and speed; expected one of them')
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorldConfig(Config):
+    """Options of worlds; a property that is None is not varied."""
+
+    presets = PRESETS
+
+    preset: str | None = option(None, 'preset that the other options change', choices=PRESETS)
+    friction: Range | None = option(
+        None, 'coefficient of sliding friction of all contacts; 0.81 otherwise', at_least=0, at_most=10
+    )  # fmt: skip
+    mass: Range | None = option(
+        None, 'factor of mass and inertia of all links', at_least=0.01, at_most=100
+    )
+    link_mass: Range | None = option(
+        None,
+        'factor of mass and inertia, drawn for each link; in addition to mass',
+        at_least=0.01,
+        at_most=100,
+    )
+    inertia: Range | None = option(
+        None,
+        'factor of the inertia of all links about their centres of mass; in addition to mass',
+        at_least=0.01,
+        at_most=100,
+    )
+    com_offset: Range | None = option(
+        None,
+        "displacement of the root link's centre of mass, in a random direction",
+        unit='m',
+        at_least=0,
+        at_most=1,
+    )
+    damping: Range | None = option(
+        None,
+        'factor of the passive damping of joints; the joints of gaits have none',
+        at_least=0,
+        at_most=1000,
+    )
+    gravity: Range | None = option(
+        None, 'magnitude of gravity; 9.8 otherwise', unit='m/s^2', at_least=0, at_most=100
+    )
+    slope: Range | None = option(
+        None,
+        'angle by which the whole ground is tilted: gravity is rotated, and positions, headings and heights '
+        'are relative to the ground',
+        unit='rad', at_least=-1.5, at_most=1.5,
+    )  # fmt: skip
+    slope_direction: Range | None = option(
+        None,
+        'direction of ascent of the slope, to the left of +x, in three dimensions; by default 0',
+        unit='rad',
+        at_least=-2 * math.pi,
+        at_most=2 * math.pi,
+    )
+    contact_depth: Range | None = option(
+        None,
+        'depth over which contacts become stiff, starting from nothing; otherwise they are stiff from the '
+        'first touch',
+        unit='m', at_least=1e-4, at_most=0.1,
+    )  # fmt: skip
+    contact_time: Range | None = option(
+        None,
+        'time constant of contacts; 0.005 otherwise, and at least two physics steps',
+        unit='s',
+        at_least=1e-3,
+        at_most=1,
+    )
+    push: PushConfig | None = option(
+        None, 'forces on the character: a mapping of options of pushes'
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.slope_direction is not None and self.slope is None:
+            raise ValueError('slope_direction has no effect without slope; give both')
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Names of the properties that are varied."""
+        return tuple(name for name in Properties._fields if getattr(self, name) is not None)
 
 
 def preset_and_options(
@@ -207,7 +176,7 @@ def preset_and_options(
     if preset is not None and (not isinstance(preset, str) or preset not in presets):
         raise ValueError(errors.unknown(f'preset of {name}', preset, presets))
     options = {**({} if preset is None else presets[preset]), **value}
-    return config.of(name, options) if options else None
+    return config.parse(name, options) if options else None
 
 
 def bounds(name: str, value: Any) -> tuple[float, float]:
@@ -248,10 +217,10 @@ def draw(
         given = getattr(config, name)
         if name == 'com_offset':
             if given is not None:
-                size = given[0] + (given[1] - given[0]) * share[0]
+                size = given.low + (given.high - given.low) * share[0]
                 array[env_id] = size * direction(share[1], share[2], spatial)
         elif given is not None:
-            array[env_id] = given[0] + (given[1] - given[0]) * share
+            array[env_id] = given.low + (given.high - given.low) * share
 
 
 def direction(first: float, second: float, spatial: bool) -> np.ndarray:

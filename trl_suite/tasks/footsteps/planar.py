@@ -28,7 +28,6 @@ from trl_suite.tasks.components.footstep_plan import (
     SWING_COLOUR,
 )
 from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
-from trl_suite.tasks.components.plans import options as plans_from
 from trl_suite.tasks.imitation import planar as imitation
 from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
@@ -245,15 +244,11 @@ def observe_all(
 class PlanarFootstepsConfig(PlanarConfig):
     """Options of `PlanarFootsteps`."""
 
-    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of StraightPlans')
+    plans: StraightPlans = option(
+        None, 'how footstep plans are drawn: a mapping of fields of StraightPlans'
+    )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     footstep_scale: float = option(1.0, FOOTSTEP_SCALE, at_least=0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set(
-            'plans', plans_from(StraightPlans, 'plans', {} if self.plans is None else self.plans)
-        )
 
 
 class PlanarFootsteps(PlanarImitation):
@@ -294,7 +289,7 @@ class PlanarFootsteps(PlanarImitation):
         """
         check_feet(character.spec)
         super().__init__(character, arena, clip, config, actuation_model=actuation_model)
-        self.plans: StraightPlans = config.plans
+        self.plans = config.plans
         self.max_landing_error = config.max_landing_error
         self._footstep_scale = config.footstep_scale
 
@@ -325,7 +320,7 @@ class PlanarFootsteps(PlanarImitation):
         }
         plans = self.plans
         options = Options(
-            plans.length[0], plans.length[1], plans.change, np.inf if self.max_landing_error is None else float(self.max_landing_error),
+            *plans.length, plans.change, np.inf if self.max_landing_error is None else float(self.max_landing_error),
             float(self._footstep_scale),
         )  # fmt: skip
         self._packs = self._pack, packed(self.plan), packed(options)

@@ -35,7 +35,6 @@ from trl_suite.tasks.components.plans import (
     MAX_LANDING_ERROR,
     Plans,
     Pushes,
-    options,
 )
 from trl_suite.tasks.footsteps.spatial_plans import Planner
 from trl_suite.tasks.footsteps.spatial_rules import (
@@ -56,9 +55,9 @@ from trl_suite.util.options import option
 class SpatialFootstepsConfig(MirroredConfig):
     """Options of `SpatialFootsteps`."""
 
-    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
+    plans: Plans = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
     goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
-    pushes: Any = option(
+    pushes: Pushes | None = option(
         None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
@@ -80,9 +79,6 @@ class SpatialFootstepsConfig(MirroredConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set('plans', options(Plans, 'plans', {} if self.plans is None else self.plans))
-        if self.pushes is not None:
-            self._set('pushes', options(Pushes, 'pushes', self.pushes))
         if self.hidden_plan and self.mirrored:
             raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
 
@@ -124,8 +120,7 @@ class SpatialFootsteps(TrackingTask):
         check_two_feet(character.spec)
         self._footstep_scales = np.atleast_1d(config.footstep_scale).astype(float)
         self._heading_scale = float(config.heading_scale)
-        self.plans: Plans = config.plans
-        self.pushes: Pushes | None = config.pushes
+        self.plans, self.pushes = config.plans, config.pushes
         self.steps = steps
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
         # The original has a limit of 1 m that has no effect.

@@ -41,6 +41,7 @@ from trl_suite.tasks.components.comparison import (
 )
 from trl_suite.tasks.components.goal_drawer import GoalDrawer
 from trl_suite.tasks.components.goals import GOAL, Goals, flag, goals
+from trl_suite.tasks.components.plans import Plans
 from trl_suite.tasks.components.rewards import tracking_terms
 from trl_suite.tasks.components.spatial_rules import (
     HEIGHT_MAP,
@@ -60,7 +61,7 @@ from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask
 from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, Outcome, conclude
 from trl_suite.tasks.terms import Term, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, compiled_loop, packed
-from trl_suite.util.options import option
+from trl_suite.util.options import Range, option
 
 REWARDS = ('goal', 'original')
 GOAL_REACHED = 0.5  # m; horizontal distance of the root within which a goal is reached
@@ -411,6 +412,6 @@ def hidden_plan(
     }
     return SpatialFootsteps(
         character, arena, steps,
-        SpatialFootstepsConfig(plans={'length': (HIDDEN_LENGTH,) * 2}, hidden_plan=True, **common),
+        SpatialFootstepsConfig(plans=Plans(length=Range(HIDDEN_LENGTH, HIDDEN_LENGTH)), hidden_plan=True, **common),
         actuation_model=actuation_model,
     )  # fmt: skip

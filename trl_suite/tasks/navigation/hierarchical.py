@@ -38,7 +38,7 @@ from trl_suite.tasks.components.footstep_plan import (
 )
 from trl_suite.tasks.components.goal_drawer import GoalDrawer
 from trl_suite.tasks.components.goals import GOAL, flag, goals
-from trl_suite.tasks.components.plans import Plans, span
+from trl_suite.tasks.components.plans import Plans
 from trl_suite.tasks.components.spatial_rules import (
     PHASE,
     TERRAIN_MAPS,
@@ -81,7 +81,7 @@ from trl_suite.tasks.task import (
 from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import packed
-from trl_suite.util.options import Config, option
+from trl_suite.util.options import Config, Range, option
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,11 +118,13 @@ class HierarchicalConfig(Config):
         f'by default {AT_GOAL:g}',
         unit='m', above=0,
     )  # fmt: skip
-    goal_distance: tuple[float, float] | None = option(
+    goal_distance: Range | None = option(
         None,
         'minimum and maximum distance of goals from the walker, or the ball, in any direction; by default '
         'the terrain determines where goals are drawn',
         unit='m',
+        at_least=0,
+        at_most=FARTHEST_GOAL,
     )
     start_phases: Sequence[float] = option(
         (0.1, 0.6),
@@ -136,13 +138,6 @@ class HierarchicalConfig(Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._set('terrain_observation', maps(self.terrain_observation))
-        self._set('start_phases', tuple(self.start_phases))
-        if self.goal_distance is not None:
-            self._set('goal_distance', span('goal_distance', self.goal_distance, 'm'))
-            if self.goal_distance[1] > FARTHEST_GOAL:
-                raise ValueError(
-                    f'goal_distance is {self.goal_distance}; expected at most {FARTHEST_GOAL:g} m'
-                )
 
 
 class HierarchicalNavigation(SpatialTask):
