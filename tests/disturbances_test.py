@@ -18,7 +18,7 @@ from helpers import FolderTest, advance, assert_goes_on, assert_rows_are_singles
 
 from trl_suite import suite
 from trl_suite.engine import PhysicsWorld, light_model, variation
-from trl_suite.tasks.disturbances import Disturbed, WorldConfig, sensors, worlds
+from trl_suite.tasks.disturbances import Disturbed, SensorConfig, WorldConfig, worlds
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -276,7 +276,7 @@ class WorldTest(parameterized.TestCase):
         self.assertEqual(config.link_mass, WorldConfig.parse('randomize', 'robot').link_mass)
         for name in worlds.PRESETS:
             self.assertIsNotNone(WorldConfig.parse('randomize', name).push)
-            sensors.configure(name)
+            SensorConfig.parse('sensors', name)
 
     def test_nothing_asked_for_is_the_plain_task(self):
         for options in ({}, {'randomize': None, 'sensors': None}, {'randomize': {}, 'sensors': {}}):

@@ -15,12 +15,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.tasks.disturbances import sensors
+from trl_suite.tasks.disturbances.sensors import SensorConfig
 from trl_suite.tasks.disturbances.task import Disturbed
 from trl_suite.tasks.disturbances.worlds import WorldConfig
 from trl_suite.tasks.task import Task
 
-OPTIONS = ('randomize', 'sensors')
+OPTIONS: Mapping[str, Any] = {'randomize': WorldConfig, 'sensors': SensorConfig}
 
 
 def disturb(task: Task, options: Mapping[str, Any]) -> Task:
@@ -35,9 +35,11 @@ def disturb(task: Task, options: Mapping[str, Any]) -> Task:
       ValueError: unknown names, values out of range, or options that contradict each other or that
         the task cannot have.
     """
-    world, sensor = options.get('randomize'), sensors.configure(options.get('sensors'))
-    if world is None or (isinstance(world, Mapping) and not world):
-        world = None
-    else:
-        world = WorldConfig.parse('randomize', world)
-    return task if world is None and sensor is None else Disturbed(task, world, sensor)
+    configs = {
+        name: OPTIONS[name].parse(name, value)
+        for name, value in options.items()
+        if value is not None and not (isinstance(value, Mapping) and not value)
+    }
+    if not configs:
+        return task
+    return Disturbed(task, configs.get('randomize'), configs.get('sensors'))

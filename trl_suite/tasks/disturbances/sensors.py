@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.kinematics.blocks import LEVELS, Block, layout
-from trl_suite.tasks.disturbances.worlds import bounds
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop
-from trl_suite.util.options import Config, option
+from trl_suite.util.options import Config, Range, checked, option
 from trl_suite.util.random import random, standard_normal
 
 TERRAIN_DROPOUT = (0.01, 0.05, 0.15)  # of the presets
@@ -28,6 +28,8 @@ FRESH, NEXT, AGAIN = range(3)  # a new episode; the next step; the same state on
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SensorConfig(Config):
     """Options of sensors; numbers are for all measured blocks, mappings for blocks by name."""
+
+    presets = MappingProxyType(dict.fromkeys(LEVELS, {}))  # what they do stands in the blocks
 
     preset: str | None = option(None, 'preset that the other options change', choices=LEVELS)
     noise: Any = option(
@@ -64,32 +66,11 @@ class SensorConfig(Config):
             where = f'delay[{block!r}]' if block else 'delay'
             message = f'{where} is {value!r}; expected whole numbers of steps up to {MOST_DELAY}'
             try:
-                low, high = bounds(where, value)
-            except (TypeError, ValueError, OverflowError):
+                low, high = checked(where, value, Range, at_least=0, at_most=MOST_DELAY)
+            except ValueError:
                 raise ValueError(message) from None
-            if low % 1 or high % 1 or not 0 <= low <= high <= MOST_DELAY:
+            if low % 1 or high % 1:
                 raise ValueError(message)
-
-
-def configure(value: Any) -> SensorConfig | None:
-    """Returns the options of sensors.
-
-    Args:
-      value: None; the name of a preset; a mapping of options by name, in which 'preset' may name a
-        preset that the other options change; or a `SensorConfig`.
-
-    Raises:
-      ValueError: anything else, unknown names, or values out of range.
-    """
-    if value is None or isinstance(value, SensorConfig):
-        return value
-    if isinstance(value, str):
-        value = {'preset': value}
-    if not isinstance(value, Mapping):
-        raise ValueError(
-            f'sensors is {value!r}; expected {", ".join(map(repr, LEVELS))}, or a dict of options'
-        )
-    return SensorConfig.of('sensors', value) if value else None
 
 
 class SensorState(NamedTuple):
@@ -164,7 +145,7 @@ def rules(
         target[part] = _of(config.noise, name, _at(config.preset, measured.noise), flags)
         bias[part] = _of(config.bias, name, _at(config.preset, measured.bias), flags)
         latest = 0 if long_steps else _at(config.preset, measured.delay)
-        delay[part] = bounds('delay', _of(config.delay, name, (0, latest), False))
+        delay[part] = checked('delay', _of(config.delay, name, (0, latest), False), Range)
         shared[1, part.start + 1 : part.stop] = True
         if measured.kind == 'map':
             given = config.terrain_dropout

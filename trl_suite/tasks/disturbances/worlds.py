@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from trl_suite.engine.variation import Properties
-from trl_suite.util import errors
 from trl_suite.util.options import Config, Range, option
 
 # Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
@@ -154,42 +153,6 @@ class WorldConfig(Config):
     def varied(self) -> tuple[str, ...]:
         """Names of the properties that are varied."""
         return tuple(name for name in Properties._fields if getattr(self, name) is not None)
-
-
-def preset_and_options(
-    name: str, value: Any, config: Any, presets: Mapping[str, Mapping[str, Any]]
-) -> Any:
-    """Returns a config from a preset, a mapping, or a config; None if nothing is asked for.
-
-    Raises:
-      ValueError: another value, an unknown name, or a value out of range.
-    """
-    if value is None or isinstance(value, config):
-        return value
-    if isinstance(value, str):
-        value = {'preset': value}
-    if not isinstance(value, Mapping):
-        raise ValueError(
-            f'{name} is {value!r}; expected {", ".join(map(repr, presets))}, or a dict of options'
-        )
-    preset = value.get('preset')
-    if preset is not None and (not isinstance(preset, str) or preset not in presets):
-        raise ValueError(errors.unknown(f'preset of {name}', preset, presets))
-    options = {**({} if preset is None else presets[preset]), **value}
-    return config.parse(name, options) if options else None
-
-
-def bounds(name: str, value: Any) -> tuple[float, float]:
-    """Returns a pair of bounds, from such a pair or from a number, which stands for both.
-
-    Raises:
-      ValueError: neither, or the first bound is the larger one.
-    """
-    pair = np.ravel(np.asarray(value, float))
-    low, high = (pair[0], pair[-1]) if len(pair) in (1, 2) else (1.0, 0.0)
-    if not low <= high:
-        raise ValueError(f'{name} is {value}; expected a number, or a lower and an upper bound')
-    return float(low), float(high)
 
 
 def draw(
