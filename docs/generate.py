@@ -29,7 +29,6 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.disturbances import sensors, worlds
-from trl_suite.terrain import checks
 from trl_suite.util import files, resources
 
 DOCS = pathlib.Path(__file__).resolve().parent
@@ -384,12 +383,12 @@ def character_index() -> str:
 
 def terrain_page(name: str) -> str:
     ground = terrain.load(name)
-    defaults = generator(ground).defaults
+    defaults = ground.generator.defaults
     sets = ground.parameter_sets or ({},)
     titles = ['value'] if len(sets) == 1 else [f'set {i}' for i in range(len(sets))]
     cells = [
         (
-            key, 'no effect' if key in terrain.IDLE.get(ground.type, ()) else checks.unit(ground.type, key),
+            key, 'no effect' if key in terrain.IDLE.get(ground.type, ()) else ground.generator.parameters[key].unit,
             *(f'{values.get(key, default):g}' for values in sets), f'{default:g}',
         )
         for key, default in defaults.items()
@@ -415,13 +414,9 @@ def terrain_page(name: str) -> str:
     )  # fmt: skip
 
 
-def generator(ground: terrain.Terrain) -> Any:
-    return (terrain.GENERATORS3D if ground.spatial else terrain.GENERATORS)[ground.type]
-
-
 def meaning(ground: terrain.Terrain) -> str:
     """Returns the description of a terrain type: the first line of its generator's docstring."""
-    return (generator(ground).function.__doc__ or '').partition('\n')[0]
+    return (ground.generator.function.__doc__ or '').partition('\n')[0]
 
 
 def terrain_index() -> str:

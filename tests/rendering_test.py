@@ -592,7 +592,7 @@ class PlotTerrainTest(FolderTest):
             ('gaps', {'length': float('nan')}, 'length is nan'),
             ('gaps', {'length': -3.0}, 'length is -3.0'),
             ('gaps', {'seed': -1}, 'seed is -1'),
-            ('gaps', {'terrain_level': float('nan')}, 'terrain_level must be a number'),
+            ('gaps', {'terrain_level': float('nan')}, 'terrain_level is .*; expected a number'),
         ):
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 rendering.plot_terrain(terrain, self.folder / 'a.png', **options)

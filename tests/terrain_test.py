@@ -296,7 +296,8 @@ class ProcessTest(parameterized.TestCase):
     def test_parameters_beyond_the_limits(self, value):
         """They are checked in a `Terrain`; a user's generator may call the function itself."""
         for kind in ('gaps', 'walls', 'steps', 'mixed', 'narrow_gaps', 'cliffs'):
-            function, defaults, _ = terrain.GENERATORS[f'var2d_{kind}']
+            generator = terrain.GENERATORS[f'var2d_{kind}']
+            function, defaults = generator.function, generator.defaults
             for parameter in defaults:
                 with self.subTest(kind, parameter=parameter):
                     profile = function(
@@ -381,7 +382,7 @@ class FileTest(parameterized.TestCase):
             self.assertEqual(values['GapSpacingMin'], 4)
         self.assertEqual(ground.parameters(), ground.parameters(0))
         for terrain_level in (math.nan, True, '0'):
-            with self.assertRaisesRegex(ValueError, 'terrain_level must be a number'):
+            with self.assertRaisesRegex(ValueError, 'terrain_level is .*; expected a number'):
                 ground.parameters(terrain_level)
 
     def test_terrain_level_with_three_sets_and_defaults(self):
@@ -452,9 +453,9 @@ class FileTest(parameterized.TestCase):
          ['GapWMin 3 is above GapWMax 2 (the default)']),
         ('reversed_depth', '{"Type": "var2d_gaps", "Params": [{"GapHMin": -1, "GapHMax": -2}]}',
          ['GapHMin -1 is above GapHMax -2']),
-        ('nan', '{"Type": "var2d_gaps", "Params": [{"GapWMin": NaN}]}', ['GapWMin', 'finite']),
-        ('infinite', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1e999}]}', ['finite']),
-        ('huge', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1' + '0' * 400 + '}]}', ['finite']),
+        ('nan', '{"Type": "var2d_gaps", "Params": [{"GapWMin": NaN}]}', ['GapWMin is nan', 'from 0 to 1000']),
+        ('infinite', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1e999}]}', ['GapWMax is inf']),
+        ('huge', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1' + '0' * 400 + '}]}', ['GapWMax is 1000', 'from 0 to 1000']),
         ('text', '{"Type": "var2d_gaps", "Params": [{"GapWMin": "1"}]}', ['GapWMin', "'1'"]),
         ('bool', '{"Type": "var2d_gaps", "Params": [{"GapWMin": true}]}', ['GapWMin', 'True']),
         ('null', '{"Type": "var2d_gaps", "Params": [{"GapWMin": null}]}', ['GapWMin', 'None']),
@@ -534,6 +535,17 @@ class RegisterTest(parameterized.TestCase):
     def test_invalid_defaults_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'mine.*HMin 2 .*above'):
             terrain.register('mine', {'HMin': 2, 'HMax': 1})
+        with self.assertRaisesRegex(ValueError, "'mine': H is inf; expected a number"):
+            terrain.register('mine', {'H': math.inf})
+
+    def test_parameters_with_limits(self):
+        height = terrain.Parameter(0.5, 0.0, 2.0)
+        terrain.register('mine', {'H': height, 'W': 1})(terrain.GENERATORS['var2d_flat'].function)
+        terrain.load({'Type': 'mine', 'Params': [{'H': 2, 'W': -1e6}]})
+        with self.assertRaisesRegex(ValueError, r'Params\[0\]: H is 3; expected .* from 0 to 2'):
+            terrain.load({'Type': 'mine', 'Params': [{'H': 3}]})
+        with self.assertRaisesRegex(ValueError, 'H is 3; expected a number from 0 to 2'):
+            terrain.register('other', {'H': height._replace(default=3)})
 
     @parameterized.parameters(
         (lambda: np.zeros(3), 'must return a Profile'),

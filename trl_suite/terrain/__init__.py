@@ -28,6 +28,7 @@ from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
 from trl_suite.terrain.planar.generators import GENERATORS, SPACING, Profile, register
 from trl_suite.terrain.planar.ground import PlanarGround
+from trl_suite.terrain.registry import Parameter
 from trl_suite.terrain.spatial.features import IDLE
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.ground import SpatialGround
@@ -48,6 +49,7 @@ __all__ = [
     'Grid',
     'Layout',
     'Movers',
+    'Parameter',
     'PlanarGround',
     'Profile',
     'SpatialGround',

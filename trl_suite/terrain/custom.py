@@ -28,14 +28,15 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain import mesh
-from trl_suite.terrain.checks import Parameters, check_new
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import GENERATORS, register_line
-from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
+from trl_suite.terrain.planar.generators import register_line
+from trl_suite.terrain.registry import START_SPAN, Parameters
+from trl_suite.terrain.spatial.generators import register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util import errors
 from trl_suite.util.files import check_size, existing
 from trl_suite.util.libraries import library
+from trl_suite.util.options import checked
 
 FARTHEST = 1e6  # m; of a vertex of a mesh
 IMAGES = {  # with the names of their formats in Pillow
@@ -93,17 +94,10 @@ def from_function(
         if name == '<lambda>' or not hasattr(function, '__name__'):
             raise ValueError(f'the function {function!r} has no name; pass name=')
     arguments = _arguments(function)
-    taken = GENERATORS if arguments == 1 else GENERATORS3D
-    existing = taken[name].function if name in taken else None
-    check_new(name, _functions.get((arguments, name), existing), function, replace)
     _check_answer(name, function, arguments)
-    _functions[arguments, name] = function
-    _register(name, function, arguments)
+    _register(name, function, arguments, replace)
     recipe = functools.partial(from_function, start_span=start_span, replace=True), (function, name)
     return CustomTerrain(name, name, ({'StartSpan': start_span},), recipe)
-
-
-_functions: dict[tuple[int, str], HeightFunction] = {}
 
 
 def _arguments(function: HeightFunction) -> int:
@@ -135,12 +129,13 @@ def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
         )
 
 
-def _register(name: str, function: HeightFunction, arguments: int) -> None:
+def _register(name: str, function: Any, arguments: int, replace: bool = True) -> None:
     if arguments == 1:
-        register_line(name, function)  # type: ignore[arg-type]
+        register_line(name, function, replace=replace)
         return
 
-    @register3d(name, {'StartSpan': 0.0}, replace=True)
+    @register3d(name, START_SPAN, replace=replace)
+    @functools.wraps(function, updated=())
     def layout(parameters: Parameters, rng: np.random.Generator) -> Layout:
         most = int(parameters['StartSpan'] / GRID)
         p, q = rng.integers(-most, most + 1, 2).tolist()
@@ -183,8 +178,7 @@ def from_heights(
         )
     if not np.isfinite(heights).all():
         raise ValueError(f'{name}: heights must be finite; the one at {_where(heights)} is not')
-    if not (errors.is_number(spacing) and 0 < spacing < math.inf):
-        raise ValueError(f'{name}: spacing is {spacing}; expected a positive number of metres')
+    checked(f'{name}: spacing', spacing, float, 'm', above=0)
     corner = -(np.array(heights.shape) // 2) if first is None else np.atleast_1d(first)
     if corner.shape != (heights.ndim,):
         raise ValueError(
@@ -338,9 +332,8 @@ def from_mesh(
     up = up or ('y' if file.suffix.lower() in mesh.Y_UP else 'z')
     if up not in ('y', 'z'):
         raise ValueError(f"{file}: up is {up!r}; expected 'y' or 'z'")
-    for name, number in (('spacing', spacing), ('scale', scale)):
-        if not (errors.is_number(number) and 0 < number < math.inf):
-            raise ValueError(f'{file}: {name} is {number}; expected a positive number')
+    checked(f'{file}: spacing', spacing, float, 'm', above=0)
+    checked(f'{file}: scale', scale, float, above=0)
     triangles = mesh.read_triangles(file) * scale
     if up == 'y':
         triangles = triangles[..., [0, 2, 1]] * (1, -1, 1)

@@ -24,8 +24,8 @@ key, if it has
 * a key that its type does not use (of another type, or misspelt), or the same key twice;
 * a value that is not a finite number;
 * a range whose Min is above its Max, whether given or default;
-* a negative spacing, width or count, or a value beyond `checks.LIMITS`. Zero is allowed: every
-  feature has at least one vertex, so every generator terminates.
+* a negative spacing, width or count, or a value beyond the limits of its `Parameter`. Zero is
+  allowed: every feature has at least one vertex, so every generator terminates.
 
 The presets are the original's terrain files under their original names (planar ones in PRESETS,
 three-dimensional ones in PRESETS3D), and `mixed_humanoid`, which is `slopes_mixed_humanoid` without
@@ -48,12 +48,13 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.terrain.checks import check
 from trl_suite.terrain.planar.generators import GENERATORS
+from trl_suite.terrain.registry import Generator, check
 from trl_suite.terrain.spatial.generators import GENERATORS3D
 from trl_suite.terrain.spatial.layout import GRID
-from trl_suite.util.errors import is_number, unknown
+from trl_suite.util.errors import check_known, is_number, unknown
 from trl_suite.util.files import existing, read_json
+from trl_suite.util.options import checked
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
 _PREFIX = 'var2d_'
@@ -82,17 +83,17 @@ class Terrain:
         if self.type not in GENERATORS and self.type not in GENERATORS3D:
             known = (*GENERATORS, *GENERATORS3D)
             raise ValueError(f'{self.name}: Type: {unknown("terrain type", self.type, known)}')
-        defaults = _defaults(self.type)
-        checked = []
+        sets = []
         for i, values in enumerate(self.parameter_sets):
             where = f'{self.name}: Params[{i}]'
             if not isinstance(values, Mapping):
                 raise ValueError(f'{where} must be an object name -> number, not {values!r}')
             for key in values:
-                if key not in defaults:
-                    raise ValueError(f'{where}: {_unknown_parameter(key, self.type)}')
-            checked.append(types.MappingProxyType(check(where, values, defaults)))
-        object.__setattr__(self, 'parameter_sets', tuple(checked))
+                if key not in self.generator.parameters:
+                    raise ValueError(f'{where}: {self._unknown_parameter(key)}')
+            values = check(where, values, self.generator.parameters)
+            sets.append(types.MappingProxyType(values))
+        object.__setattr__(self, 'parameter_sets', tuple(sets))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Terrain, (self.name, self.type, tuple(map(dict, self.parameter_sets)))
@@ -103,10 +104,14 @@ class Terrain:
         return self.type in GENERATORS3D
 
     @property
+    def generator(self) -> Generator:
+        """Functions and parameters of its type."""
+        return (GENERATORS3D if self.spatial else GENERATORS)[self.type]
+
+    @property
     def contents(self) -> tuple[Any, ...]:
         """What the ground depends on: type, parameter sets, and the functions of the type."""
-        registry: Mapping[str, Any] = GENERATORS3D if self.spatial else GENERATORS
-        return self.type, self.parameter_sets, tuple(registry[self.type])
+        return self.type, self.parameter_sets, tuple(self.generator)
 
     def parameters(self, terrain_level: float = 0.0) -> dict[str, float]:
         """Returns a value for every parameter of the type.
@@ -119,9 +124,9 @@ class Terrain:
           ValueError: terrain_level is not a number.
         """
         if not is_number(terrain_level):
-            raise ValueError(f'terrain_level must be a number, not {terrain_level!r}')
-        defaults = _defaults(self.type)
-        sets = [{**defaults, **values} for values in self.parameter_sets] or [dict(defaults)]
+            raise ValueError(f'terrain_level is {terrain_level!r}; expected a number')
+        defaults = self.generator.defaults
+        sets = [{**defaults, **values} for values in self.parameter_sets] or [defaults]
         clamped = min(max(float(terrain_level), 0.0), len(sets) - 1.0)
         k = int(clamped)
         weight = clamped - k
@@ -129,29 +134,19 @@ class Terrain:
             return sets[k]
         return {key: (1 - weight) * a + weight * sets[k + 1][key] for key, a in sets[k].items()}
 
-
-def _defaults(type_name: str) -> Mapping[str, float]:
-    if type_name in GENERATORS3D:
-        return GENERATORS3D[type_name].defaults
-    return GENERATORS[type_name].defaults
-
-
-def _unknown_parameter(key: object, type_name: str) -> str:
-    registry: Mapping[str, Any] = GENERATORS3D if type_name in GENERATORS3D else GENERATORS
-    owners = [name for name, generator in registry.items() if key in generator.defaults]
-    if owners:
-        return f'{key!r} has no effect in {type_name}, only in {", ".join(owners)}'
-    defaults = registry[type_name].defaults
-    if not defaults:
-        return f'unknown parameter {key!r}; {type_name} has none'
-    return unknown(f'parameter of {type_name}', key, defaults)
+    def _unknown_parameter(self, key: object) -> str:
+        registry = GENERATORS3D if self.spatial else GENERATORS
+        owners = [name for name, generator in registry.items() if key in generator.parameters]
+        if owners:
+            return f'{key!r} has no effect in {self.type}, only in {", ".join(owners)}'
+        if not self.generator.parameters:
+            return f'unknown parameter {key!r}; {self.type} has none'
+        return unknown(f'parameter of {self.type}', key, self.generator.parameters)
 
 
 def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     known = ('Type', 'Params', *_UNUSED)
-    for key in content:
-        if key not in known:
-            raise ValueError(f'{name}: {unknown("key", key, known)}')
+    check_known(f'key of {name}:', known, *content)
     if 'Type' not in content:
         raise ValueError(f"{name}: key 'Type' is missing; known types: {', '.join(GENERATORS)}")
     if not isinstance(content['Type'], str):
@@ -167,10 +162,10 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
             if kind == 'var2d_cliffs' and isinstance(each, Mapping) else each
             for each in sets
         ]  # fmt: skip
-    unused = check(name, {key: content[key] for key in _UNUSED if key in content})
-    for key in _UNUSED[1:]:
-        if kind in GENERATORS3D and unused.get(key, GRID) != GRID:
-            raise ValueError(f'{name}: {key} must be {GRID:g} m, not {content[key]!r}')
+    for key in [key for key in _UNUSED if key in content]:
+        value = checked(f'{name}: {key}', content[key], float)
+        if kind in GENERATORS3D and key != 'GroundWidth' and value != GRID:
+            raise ValueError(f'{name}: {key} must be {GRID:g} m, not {value!r}')
     return Terrain(name, kind, tuple(sets))
 
 
@@ -207,8 +202,7 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
         )
     name = os.fspath(source)
     if isinstance(source, str) and not name.endswith(('.json', '.txt')):
-        if name not in PRESETS and name not in PRESETS3D:
-            raise ValueError(unknown('terrain', name, (*PRESETS, *PRESETS3D)))
+        check_known('terrain', (*PRESETS, *PRESETS3D), name)
         return PRESETS[name] if name in PRESETS else PRESETS3D[name]
     content = read_json(existing(name), _without_repetition)
     if not isinstance(content, dict):

@@ -11,7 +11,6 @@ import numpy as np
 from trl_suite import suite
 from trl_suite import terrain as terrains
 from trl_suite.rendering.web_server import load_viser
-from trl_suite.terrain.checks import LIMITS
 from trl_suite.viewing.session import PUSHES, Loaded, Session
 
 SPEEDS = {'1/8': 0.125, '1/4': 0.25, '1/2': 0.5, '1': 1.0, '2': 2.0, '4': 4.0}
@@ -134,7 +133,7 @@ class Panel:
         preset.on_update(lambda event: viewer.choose_terrain(event.target.value))
         sliders = {}
         for key, value in terrain.parameters().items():
-            low, high = slider_range(key, value)
+            low, high = slider_range(terrain.generator.parameters[key], value)
             step = 10.0 ** np.floor(np.log10((high - low) / SLIDER_STEPS))
             sliders[key] = gui.add_slider(key, min=low, max=high, step=step, initial_value=value)
         self._fitted += [preset, *sliders.values()]
@@ -199,8 +198,8 @@ class Panel:
         self.tell(message, 'Please wait', 'blue')
 
 
-def slider_range(name: str, value: float) -> tuple[float, float]:
+def slider_range(parameter: terrains.Parameter, value: float) -> tuple[float, float]:
     """Returns the range of the slider of a terrain parameter: 0 to twice its value, within limits."""
-    low, high = LIMITS.get(name.removesuffix('Min').removesuffix('Max'), (-np.inf, np.inf))
+    _, low, high, _ = parameter
     reach = 2 * abs(value) or 1.0
     return float(max(low, -reach if value < 0 or low < 0 else 0.0)), float(min(high, reach))

@@ -13,33 +13,51 @@ distribution, not draw by draw.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.checks import LIMITS, Parameters
 from trl_suite.terrain.planar.generators import SPACING, Profile, cells, register
+from trl_suite.terrain.registry import Parameter, Parameters, limited
 from trl_suite.util import random
 from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
 LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
 
-# Defaults of the parameters, by feature (those of the original).
-GAPS = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
-        'GapHMin': -2, 'GapHMax': -2}  # fmt: skip
-WALLS = {'WallSpacingMin': 6, 'WallSpacingMax': 8, 'WallWMin': 0.2, 'WallWMax': 0.2,
-         'WallHMin': 0.25, 'WallHMax': 0.5}  # fmt: skip
-STEPS = {'StepSpacingMin': 5, 'StepSpacingMax': 7, 'StepH0Min': 0.1, 'StepH0Max': 0.4,
-         'StepH1Min': -0.4, 'StepH1Max': -0.1}  # fmt: skip
-NARROW_GAPS = {'NarrowGapSpacingMin': 3, 'NarrowGapSpacingMax': 6,
-               'NarrowGapDistMin': 0.1, 'NarrowGapDistMax': 0.4,
-               'NarrowGapWMin': 0.15, 'NarrowGapWMax': 0.5,
-               'NarrowGapDepthMin': -2, 'NarrowGapDepthMax': -2,
-               'NarrowGapCountMin': 1, 'NarrowGapCountMax': 4}  # fmt: skip
-CLIFFS = {'CliffSpacingMin': 5, 'CliffSpacingMax': 7, 'CliffH0Min': 0.1, 'CliffH0Max': 0.4,
-          'CliffH1Min': -0.4, 'CliffH1Max': -0.1, 'CliffMiniCountMax': 0}  # fmt: skip
-BUMPS = {'BumpHMin': 0, 'BumpHMax': 0.03}
-SLOPES = {'SlopeDeltaRange': 0.25, 'SlopeDeltaMin': -0.35, 'SlopeDeltaMax': 0.35}
+MOST_LENGTH, MOST_COUNT = 1e3, 100  # m, number
+_lengths = functools.partial(limited, 0.0, MOST_LENGTH)
+_counts = functools.partial(limited, 0.0, MOST_COUNT, '1, number')
+_heights = functools.partial(limited, -1e3, 1e3)
+_slopes = functools.partial(limited, -100.0, 100.0, '1, rise per m')
+# Parameters, by feature; the defaults are those of the original.
+GAPS = {
+    **_lengths(GapSpacingMin=4, GapSpacingMax=7, GapWMin=0.5, GapWMax=2),
+    **_heights(GapHMin=-2, GapHMax=-2),
+}
+WALLS = {
+    **_lengths(WallSpacingMin=6, WallSpacingMax=8, WallWMin=0.2, WallWMax=0.2),
+    **_heights(WallHMin=0.25, WallHMax=0.5),
+}
+STEPS = {
+    **_lengths(StepSpacingMin=5, StepSpacingMax=7),
+    **_heights(StepH0Min=0.1, StepH0Max=0.4, StepH1Min=-0.4, StepH1Max=-0.1),
+}
+NARROW_GAPS = {
+    **_lengths(NarrowGapSpacingMin=3, NarrowGapSpacingMax=6),
+    **_lengths(NarrowGapDistMin=0.1, NarrowGapDistMax=0.4),
+    **_lengths(NarrowGapWMin=0.15, NarrowGapWMax=0.5),
+    **_heights(NarrowGapDepthMin=-2, NarrowGapDepthMax=-2),
+    **_counts(NarrowGapCountMin=1, NarrowGapCountMax=4),
+}
+CLIFFS = {
+    **_lengths(CliffSpacingMin=5, CliffSpacingMax=7),
+    **_heights(CliffH0Min=0.1, CliffH0Max=0.4, CliffH1Min=-0.4, CliffH1Max=-0.1),
+    **_counts(CliffMiniCountMax=0),
+}
+BUMPS = _heights(BumpHMin=0, BumpHMax=0.03)
+SLOPES = _slopes(SlopeDeltaRange=0.25, SlopeDeltaMin=-0.35, SlopeDeltaMax=0.35)
 
 # Features: each function draws one and writes it as runs of equal height, (number of vertices,
 # height), in order. Heights are relative to the ground before the feature; the last run is the
@@ -55,7 +73,7 @@ class Runs(NamedTuple):
 
 # Features, and the index of their first parameter among those of the type. A Max follows its Min.
 _GAP, _STEP, _WALL, _MIXED, _NARROW_GAPS, _CLIFF = range(6)
-_MIXTURE: Parameters = {**GAPS, **WALLS, **STEPS}
+_MIXTURE = {**GAPS, **WALLS, **STEPS}
 _SPACING, _WIDTH, _TOP = (list(GAPS).index(f'Gap{name}Min') for name in ('Spacing', 'W', 'H'))
 _RISES = list(STEPS).index('StepH0Min'), list(STEPS).index('StepH1Min')
 _DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
@@ -64,8 +82,8 @@ _DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
 _LEDGES = list(CLIFFS).index('CliffMiniCountMax')
 _FIRST_WALL, _FIRST_STEP = len(GAPS), len(GAPS) + len(WALLS)
 _NAMES = tuple(tuple(names) for names in (GAPS, STEPS, WALLS, _MIXTURE, NARROW_GAPS, CLIFFS))
-_MOST_COUNT, _MOST_CELLS = round(LIMITS['NarrowGapCount'][1]), cells(LIMITS['GapW'][1])
-_MOST_RUNS = 3 * _MOST_COUNT + 3  # of a feature
+_MOST_CELLS = cells(MOST_LENGTH)
+_MOST_RUNS = 3 * MOST_COUNT + 3  # of a feature
 
 
 @compiled_inline
@@ -82,7 +100,7 @@ def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
 @compiled_inline
 def _integer(low: float, high: float, bits: int) -> int:
     """Draws an integer, both ends included; interpolated counts are truncated only here."""
-    first, last = nearest_index(low, _MOST_COUNT + 1), nearest_index(high, _MOST_COUNT + 1)
+    first, last = nearest_index(low, MOST_COUNT + 1), nearest_index(high, MOST_COUNT + 1)
     return first + int((last - first + 1) * random.draw(bits))
 
 
@@ -284,7 +302,7 @@ def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> P
     return _repeat(_CLIFF, parameters, length, rng)
 
 
-def _register_feature(name: str, kind: int, defaults: Parameters, words: str) -> None:
+def _register_feature(name: str, kind: int, own: Mapping[str, Parameter], words: str) -> None:
     """Registers a feature twice: on level ground and on rolling ground.
 
     Args:
@@ -298,8 +316,8 @@ def _register_feature(name: str, kind: int, defaults: Parameters, words: str) ->
         return _sloped(level(parameters, length, rng), parameters, rng)
 
     level.__doc__, rolling.__doc__ = f'{words} on level ground.', f'{words} on rolling ground.'
-    register(f'var2d_{name}', defaults)(level)
-    register(f'var2d_slopes_{name}', {**defaults, **SLOPES})(rolling)
+    register(f'var2d_{name}', own)(level)
+    register(f'var2d_slopes_{name}', {**own, **SLOPES})(rolling)
 
 
 _register_feature('gaps', _GAP, GAPS, 'Gaps')

@@ -19,15 +19,15 @@ has the original's terrain types. `register` adds a type:
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.checks import NO_PARAMETERS, Parameters, check, check_new
-from trl_suite.util.errors import unknown
+from trl_suite.terrain.registry import NONE, START_SPAN, Generator, Parameter, Parameters, adding
+from trl_suite.util.errors import check_known
 
 SPACING = 0.025  # m between vertices
 STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
@@ -52,56 +52,40 @@ class Profile:
 Function = Callable[[Parameters, float, np.random.Generator], Profile]
 
 
-class Generator(NamedTuple):
-    """A terrain type: its function, and its parameters with their defaults.
-
-    Ground that is the same in every episode also has a `line`, a function that returns heights (k,)
-    at x (k,), m; a `PlanarGround` then takes its vertices from this function.
-    """
-
-    function: Function
-    defaults: Mapping[str, float]
-    line: Callable[[np.ndarray], np.ndarray] | None = None
-
-
 _generators: dict[str, Generator] = {}
 GENERATORS: Mapping[str, Generator] = types.MappingProxyType(_generators)
 
 
 def register(
-    type_name: str, defaults: Parameters = NO_PARAMETERS, *, replace: bool = False
+    type_name: str, defaults: Mapping[str, Parameter | float] = NONE, *, replace: bool = False
 ) -> Callable[[Function], Function]:
     """Decorates a function as the generator of a new terrain type.
 
     Args:
       type_name: the `Type` in terrain files.
-      defaults: the names of all its parameters, with their defaults.
+      defaults: the names of all its parameters, with their defaults; a `Parameter` has limits, too.
       replace: whether a type that belongs to another function may be replaced. A function with the
         same module and name, e.g. of a notebook cell that is run again, always replaces it.
 
     Raises:
-      ValueError: the name is taken, or a default is invalid (see `check`).
+      ValueError: the name is taken; or a default is not finite, beyond its limits, or a Min above its
+        Max.
     """
-    checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
-
-    def add(function: Function) -> Function:
-        known = _generators.get(type_name)
-        check_new(type_name, known and known.function, function, replace)
-        _generators[type_name] = Generator(function, checked)
-        return function
-
-    return add
+    return adding(_generators, type_name, defaults, replace)
 
 
-def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Registers planar ground whose heights are a function of x; replaces a type of that name."""
+def register_line(
+    type_name: str, line: Callable[[np.ndarray], np.ndarray], *, replace: bool = True
+) -> None:
+    """Registers planar ground whose heights are a function of x."""
 
+    @functools.wraps(line, updated=())
     def ahead(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         heights = line(SPACING * np.arange(cells(length) + 1))
         rises = np.diff(heights)
         return Profile(heights[1:] - heights[0], np.abs(rises) > STEEP * SPACING)
 
-    _generators[type_name] = Generator(ahead, types.MappingProxyType({'StartSpan': 0.0}), line)
+    adding(_generators, type_name, START_SPAN, replace, line)(ahead)
 
 
 def draw(
@@ -119,10 +103,11 @@ def draw(
       ValueError: unknown type, a length that is not positive or above LONGEST, or a generator that
         returns anything but a finite `Profile` of at least one vertex.
     """
-    if type_name not in _generators:
-        raise ValueError(unknown('terrain type', type_name, _generators))
+    check_known('terrain type', _generators, type_name)
     if not 0 < length <= LONGEST:
-        raise ValueError(f'length must be above 0 and at most {LONGEST:g} m, not {length!r}')
+        raise ValueError(
+            f'length is {length!r}; expected a number above 0 and at most {LONGEST:g} m'
+        )
     profile = _generators[type_name].function(parameters, length, rng)
     fault = ''
     if not isinstance(profile, Profile):

@@ -10,11 +10,12 @@ the start; belts do not drift by slices; the ground does not depend on the chara
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 
-from trl_suite.terrain.checks import Parameters
+from trl_suite.terrain.registry import Parameter, Parameters, limited
 from trl_suite.terrain.spatial import noise
 from trl_suite.terrain.spatial.generators import register3d
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, GridFunction, Layout, Movers, boxes
@@ -36,21 +37,44 @@ MOVER_SPAN = 20.0  # m; half side of the square that contains the paths of movin
 PLACE_SPAN = {'obstacles3d': 24.0, 'moving': 12.0}  # m; half sides of the squares of start places
 BELT_TOP = 0.01  # m above the plane
 
-# Defaults of the parameters (those of the original).
-PATH = {'PathWidth0': 3, 'PathHeight0': 0, 'PathHeight1': -2, 'PathLength': 10,
-        'PathTurnLength': 5}  # fmt: skip
-TRAIL = {'PathWidth0': 3, 'PathWidth1': 3, 'PathWidthDeltaStdev': 0.1, 'PathMaxTurnDelta': 1.5,
-         'PathHeight0': 0, 'PathHeight1': -2, 'StepHeightMin': 0.1, 'StepHeightMax': 0.2,
-         'TrailStepProb': 0.2, 'PathLength': 10, 'PathTurnLength': 5}  # fmt: skip
-STAIRS = {'StepHeightMin': 0.1, 'StepHeightMax': 0.2, 'StepSpacingMin': 1,
-          'StepSpacingMax': 2}  # fmt: skip
-OBSTACLES = {'ObstacleDensity': 0.015, 'ObstacleWidth0': 0.5, 'ObstacleWidth1': 7,
-             'ObstacleHeight0': 1, 'ObstacleHeight1': 5}  # fmt: skip
-MOVING = {'ObstacleWidth0': 0.5, 'ObstacleWidth1': 7, 'ObstacleSpeed0': 0.1, 'ObstacleSpeed1': 2,
-          'ObstacleSpeedLerpPow': 1}  # fmt: skip
-MOVERS = {'NumObstacles': 10, 'ObstacleHeight0': 1, 'ObstacleHeight1': 5, **MOVING}
-CONVEYORS = {'ConveyorStripLength': 10, 'ConveyorNumStrips': 4, 'ConveyorSpacing': 3, **MOVING,
-             'ConveyorNumSlices': 10}  # fmt: skip
+_lengths = functools.partial(limited, 0.0, 1e3)
+_counts = functools.partial(limited, 0.0, 100.0, '1, number')
+_heights = functools.partial(limited, -20.0, 20.0)
+# Parameters; the defaults are those of the original.
+PATH = {
+    **_lengths(PathWidth0=3),
+    **_heights(PathHeight0=0, PathHeight1=-2),
+    'PathLength': Parameter(10, 0.2, 1e3),
+    **_lengths(PathTurnLength=5),
+}
+TRAIL = {
+    **_lengths(PathWidth0=3, PathWidth1=3, PathWidthDeltaStdev=0.1),
+    'PathMaxTurnDelta': Parameter(1.5, 0.0, 2.0, 'rad'),
+    **_heights(PathHeight0=0, PathHeight1=-2, StepHeightMin=0.1, StepHeightMax=0.2),
+    'TrailStepProb': Parameter(0.2, 0.0, 1.0, '1, probability'),
+    'PathLength': PATH['PathLength'],
+    **_lengths(PathTurnLength=5),
+}
+STAIRS = {
+    **_heights(StepHeightMin=0.1, StepHeightMax=0.2),
+    **_lengths(StepSpacingMin=1, StepSpacingMax=2),
+}
+_WIDTHS = limited(0.0, 40.0, ObstacleWidth0=0.5, ObstacleWidth1=7)
+_HEIGHTS = limited(0.0, 1e3, ObstacleHeight0=1, ObstacleHeight1=5)
+OBSTACLES = {'ObstacleDensity': Parameter(0.015, 0.0, 2.0, '1/m²'), **_WIDTHS, **_HEIGHTS}
+MOVING = {
+    **_WIDTHS,
+    **limited(1e-6, 100.0, 'm/s', ObstacleSpeed0=0.1, ObstacleSpeed1=2),
+    'ObstacleSpeedLerpPow': Parameter(1, 0.0, 100.0, '1, exponent'),
+}
+MOVERS = {**_counts(NumObstacles=10), **_HEIGHTS, **MOVING}
+CONVEYORS = {
+    **_lengths(ConveyorStripLength=10),
+    **_counts(ConveyorNumStrips=4),
+    **_lengths(ConveyorSpacing=3),
+    **MOVING,
+    **_counts(ConveyorNumSlices=10),
+}
 # Parameters without effect, by type; in the original only those of belts have an effect.
 IDLE = {
     'trail3d': ('PathLength', 'PathTurnLength'), 'var3d_stairs': ('StepSpacingMin', 'StepSpacingMax'),
@@ -94,7 +118,7 @@ def flat(parameters: Parameters, rng: np.random.Generator) -> Layout:
     return Layout()
 
 
-@register3d('var3d_ramp', {'Slope': 0})
+@register3d('var3d_ramp', limited(-10.0, 10.0, '1, rise per m', Slope=0))
 def ramp(parameters: Parameters, rng: np.random.Generator) -> Layout:
     """Level around the start, rising ahead of it and falling behind."""
     slope = parameters['Slope']
@@ -133,7 +157,7 @@ def stairs(parameters: Parameters, rng: np.random.Generator) -> Layout:
     return Layout(level=None, boxes=treads)
 
 
-@register3d('var3d_checkers', {'Slope': 0})
+@register3d('var3d_checkers', limited(-10.0, 10.0, Slope=0))
 def checkers(parameters: Parameters, rng: np.random.Generator) -> Layout:
     """Squares of 1 m, alternate ones raised by `Slope` m, with flanks of one cell."""
     squares = round(1 / GRID)

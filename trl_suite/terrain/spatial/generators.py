@@ -21,44 +21,27 @@ from __future__ import annotations
 import dataclasses
 import types
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.checks import NO_PARAMETERS, Parameters, check, check_new
+from trl_suite.terrain.registry import NONE, Generator, Parameter, Parameters, adding
 from trl_suite.terrain.spatial.layout import Layout
-from trl_suite.util.errors import unknown
+from trl_suite.util.errors import check_known
 
 Function3D = Callable[[Parameters, np.random.Generator], Layout]
 
-
-class Generator3D(NamedTuple):
-    """A three-dimensional terrain type: its function, and its parameters with their defaults."""
-
-    function: Function3D
-    defaults: Mapping[str, float]
-
-
-_generators: dict[str, Generator3D] = {}
-GENERATORS3D: Mapping[str, Generator3D] = types.MappingProxyType(_generators)
+_generators: dict[str, Generator] = {}
+GENERATORS3D: Mapping[str, Generator] = types.MappingProxyType(_generators)
 
 
 def register3d(
-    type_name: str, defaults: Parameters = NO_PARAMETERS, *, replace: bool = False
+    type_name: str, defaults: Mapping[str, Parameter | float] = NONE, *, replace: bool = False
 ) -> Callable[[Function3D], Function3D]:
     """Decorates a function as the generator of a new three-dimensional terrain type.
 
     Arguments and errors are those of `register`.
     """
-    checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
-
-    def add(function: Function3D) -> Function3D:
-        known = _generators.get(type_name)
-        check_new(type_name, known and known.function, function, replace)
-        _generators[type_name] = Generator3D(function, checked)
-        return function
-
-    return add
+    return adding(_generators, type_name, defaults, replace)
 
 
 def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> Layout:
@@ -72,8 +55,7 @@ def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> 
     Raises:
       ValueError: unknown type, or a generator that returns anything but a valid `Layout`.
     """
-    if type_name not in _generators:
-        raise ValueError(unknown('three-dimensional terrain type', type_name, _generators))
+    check_known('three-dimensional terrain type', _generators, type_name)
     layout = _generators[type_name].function(parameters, rng)
     if not isinstance(layout, Layout):
         fault = f'must return a Layout, not {type(layout).__name__}'
