@@ -15,7 +15,8 @@ from trl_suite.environments import arguments
 from trl_suite.environments.core import Core
 from trl_suite.rendering import contexts
 from trl_suite.tasks.task import Task
-from trl_suite.util import errors, interrupts
+from trl_suite.util import interrupts
+from trl_suite.util.options import checked
 
 HIGHLIGHT = (0.0, 0.5, 0.3)  # colour of a character with a reward of 1, as in dm_control.suite
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
@@ -77,8 +78,8 @@ class Environment(composer.Environment):
         self.step_limit = arguments.check_step_limit(step_limit)
         if isinstance(random, (int, float, str, bytes, np.random.Generator)):
             arguments.check_seed('random', random)
-        errors.check_kind('flat_observation', flat_observation, bool)
-        errors.check_kind('visualize_reward', visualize_reward, bool)
+        checked('flat_observation', flat_observation, bool)
+        checked('visualize_reward', visualize_reward, bool)
         self._flat_observation = flat_observation
         self.at_limit = False
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None

@@ -26,6 +26,7 @@ from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 MOST_ENVS = 2**20  # simulations of one batch
 MOST_THREADS = 4096
@@ -106,11 +107,11 @@ class VectorEnvironment:
         Raises:
           ValueError: unknown names or options, or numbers out of range.
         """
-        errors.check_whole('num_envs', num_envs, 1, MOST_ENVS)
-        errors.check_whole('num_threads', num_threads, 0, MOST_THREADS, '; 0 uses all cores')
+        checked('num_envs', num_envs, int, at_least=1, at_most=MOST_ENVS)
+        checked('num_threads', num_threads, int, at_least=0, at_most=MOST_THREADS)
         if autoreset not in AUTORESET:
             raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
-        errors.check_kind('flat_observation', flat_observation, bool)
+        checked('flat_observation', flat_observation, bool)
         self.spec, self.dtype = spec_of(environment), arguments.check_dtype(dtype)
         self.num_envs, self.autoreset = int(num_envs), autoreset
         self.flat_observation = flat_observation

@@ -29,7 +29,7 @@ FRESH, NEXT, AGAIN = range(3)  # a new episode; the next step; the same state on
 class SensorConfig(Config):
     """Options of sensors; numbers are for all measured blocks, mappings for blocks by name."""
 
-    presets = MappingProxyType(dict.fromkeys(LEVELS, {}))  # what they do stands in the blocks
+    presets = MappingProxyType({level: {} for level in LEVELS})  # what they do stands in the blocks
 
     preset: str | None = option(None, 'preset that the other options change', choices=LEVELS)
     noise: Any = option(
