@@ -196,7 +196,7 @@ class EvaluateTest(parameterized.TestCase):
             ("episodes is 'x'; expected a whole number", GAPS, policy, 'x'),
             ('episodes is 1000000000; expected .* to 1000000', GAPS, policy, 10**9),
             ('seed is -1', GAPS, policy, 1, -1),
-            ("seed is 'x'; expected 0 or a positive integer", GAPS, policy, 1, 'x'),
+            ("seed is 'x'; expected a whole number at least 0", GAPS, policy, 1, 'x'),
             ("seed is 'x'; expected a whole number from 0 to 4294967295", GAPS, policy, 1, ['x']),
             ('seed is 4294967296; expected a whole number', GAPS, policy, 1, [2**32]),
             ('num_threads is -1', GAPS, policy, 1, 0, -1),

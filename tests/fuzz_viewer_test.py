@@ -251,7 +251,7 @@ class ValuesTest(ViewerTest):
             ('Preset', {'Type': 'flat'}, 'unknown Preset'), ('Speed', '16', 'unknown Speed'),
             ('to', 'down', 'unknown to'), ('to', None, 'unknown to'),
             ('m/s', math.nan, r'm/s is nan; expected a number'), ('m/s', '1', "m/s is '1'"),
-            ('m/s', 5.1, r'm/s is 5.1; expected a number from 0.1 to 5.0'),
+            ('m/s', 5.1, r'm/s is 5.1; expected a number from 0.1 to 5'),
             ('m/s', -math.inf, 'm/s is -inf; expected'), ('m/s', True, 'm/s is True; expected'),
             ('Seed', -1, 'Seed is -1; expected a whole number from 0 to 4294967295'),
             ('Seed', 1.5, 'Seed is 1.5'), ('Seed', math.inf, 'Seed is inf'), ('Seed', 2**40, 'Seed is 1'),

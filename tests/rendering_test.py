@@ -85,8 +85,8 @@ class FrameTest(parameterized.TestCase):
         ({'camera': 2}, r'camera is 2; expected -1 to 1'),
         ({'camera': -2}, r'camera is -2'),
         ({'camera': None}, 'camera is None; expected a string or a whole number'),
-        ({'height': 0}, 'height is 0; expected a whole number from 1 to 1080 pixels'),
-        ({'width': 1921}, 'width is 1921; expected a whole number from 1 to 1920 pixels'),
+        ({'height': 0}, 'height is 0; expected a whole number from 1 to 1080, in pixels'),
+        ({'width': 1921}, 'width is 1921; expected a whole number from 1 to 1920, in pixels'),
         ({'ghost': 'no'}, "ghost is 'no'; expected True or False"),
     )
     def test_invalid_arguments_are_rejected(self, options, message):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import math
-import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -23,7 +22,8 @@ from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.navigation.scripted import scripted
-from trl_suite.util import errors, machine
+from trl_suite.util import machine
+from trl_suite.util.options import checked
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 MOST_EPISODES = 1_000_000
@@ -150,16 +150,13 @@ def evaluate_all(
 
 def _seeds(episodes: int, seed: int | Sequence[int]) -> list[int]:
     """Returns the seed of each episode."""
-    errors.check_whole('episodes', episodes, 1, MOST_EPISODES)
+    episodes = checked('episodes', episodes, int, at_least=1, at_most=MOST_EPISODES)
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
         if len(seed) != episodes:
             raise ValueError(f'{len(seed)} seeds for {episodes} episodes')
-        for each in seed:
-            errors.check_whole('seed', each, 0, 2**32 - 1)
-        return list(map(int, seed))
-    if not isinstance(seed, numbers.Real) or seed % 1 or seed < 0:
-        raise ValueError(f'seed is {seed!r}; expected 0 or a positive integer')
-    return np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
+        return [checked('seed', each, int, at_least=0, at_most=2**32 - 1) for each in seed]
+    sequence = np.random.SeedSequence(checked('seed', seed, int, at_least=0))
+    return sequence.generate_state(episodes, np.uint32).tolist()
 
 
 def _run(

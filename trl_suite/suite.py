@@ -63,14 +63,8 @@ def load(
     Raises:
       ValueError: unknown names or options; the message has the closest matches.
     """
-    if str(domain_name) not in TASKS_BY_DOMAIN:
-        raise ValueError(errors.unknown('domain', domain_name, TASKS_BY_DOMAIN))
-    if task_name not in TASKS_BY_DOMAIN[domain_name]:
-        raise ValueError(
-            errors.unknown(
-                f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name]
-            )
-        )
+    errors.check_known('domain', TASKS_BY_DOMAIN, domain_name)
+    errors.check_known(f'task of domain {domain_name!r}', TASKS_BY_DOMAIN[domain_name], task_name)
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
     environment_kwargs.setdefault('visualize_reward', visualize_reward)
     spec = catalogue.BY_TASK[domain_name, task_name]
@@ -213,8 +207,7 @@ def combine(
 
 def _type(title: str, character: characters.CharacterSpec) -> TaskType:
     """Returns the task type of a title for a character."""
-    if title not in TITLES:
-        raise ValueError(errors.unknown('task', title, TITLES))
+    errors.check_known('task', TITLES, title)
     types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == title}
     type_ = types.get(character.spatial) or next(iter(types.values()))
     _check_dimensions(type_, character)
@@ -274,9 +267,7 @@ def build_environment(
     task_kwargs = arguments.absolute(errors.options('task_kwargs', task_kwargs))
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation', 'visualize_reward']
-    for name in environment_kwargs:
-        if name not in known:
-            raise ValueError(errors.unknown('option of an environment', name, known))
+    errors.check_known('option of an environment', known, *environment_kwargs)
     options = {'step_limit': spec.step_limit, **environment_kwargs}
     for name in _ENVIRONMENT_OPTIONS:
         if name in task_kwargs:

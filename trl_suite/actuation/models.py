@@ -172,8 +172,7 @@ def _add_position(
     rotations: str = 'vector',
     **_: object,
 ) -> ActionMap:
-    if rotations not in ROTATIONS:
-        raise ValueError(errors.unknown('description of rotations', rotations, ROTATIONS))
+    errors.check_known('description of rotations', ROTATIONS, rotations)
     limits = character.torque_limits
     joints = list(character.spec.joints.values())
     kd = np.array([joint.kd for joint in joints])
@@ -296,8 +295,7 @@ def character_muscles(
         raise ValueError(
             f'character {name!r} has no muscles; these have: {", ".join(muscle_tables.MUSCLES)}'
         )
-    if muscle_set not in sets:
-        raise ValueError(errors.unknown(f'muscle set of {name!r}', muscle_set, sets))
+    errors.check_known(f'muscle set of {name!r}', sets, muscle_set)
     return sets[muscle_set]
 
 

@@ -128,11 +128,7 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
         raise ValueError(
             f"torque_pose is {given!r}; expected True, 'human', a JSON file, or a table by joint"
         )
-    for joint in given:
-        if joint not in joints:
-            raise ValueError(
-                errors.unknown(f'joint of {character!r} in torque_pose', joint, joints)
-            )
+    errors.check_known(f'joint of {character!r} in torque_pose', joints, *given)
     return {joint: _curve(joint, entry) for joint, entry in given.items()}
 
 

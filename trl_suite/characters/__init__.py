@@ -36,8 +36,7 @@ def make(character: str | CharacterSpec) -> Character:
       TypeError: neither a name nor a `CharacterSpec`.
     """
     if isinstance(character, str):
-        if character not in CHARACTERS:
-            raise ValueError(errors.unknown('character', character, CHARACTERS))
+        errors.check_known('character', CHARACTERS, character)
         character = CHARACTERS[character]
     if not isinstance(character, CharacterSpec):
         raise TypeError(

@@ -49,6 +49,7 @@ from trl_suite.characters.model_file import (
 from trl_suite.characters.specs import CHARACTERS
 from trl_suite.util import errors, limited
 from trl_suite.util.files import check_size, existing
+from trl_suite.util.options import checked
 
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
@@ -118,7 +119,7 @@ def from_file(
         ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
         ('description', description, str), ('balance_inertia', balance_inertia, bool),
     ):  # fmt: skip
-        errors.check_kind(option, value, kind)
+        checked(option, value, kind)
     for what, names, least in (
         ('end effectors', end_effectors, 1), ('fall links', fall_links, 0),
         ('stumble-exempt links', stumble_exempt, 0),
@@ -146,9 +147,7 @@ def from_file(
                 for names in (end_effectors, fall_links, stumble_exempt)
             ),
         )  # fmt: skip
-        for joint in joints or {}:
-            if joint not in spec.joints:
-                raise ValueError(errors.unknown('joint', joint, spec.joints))
+        errors.check_known('joint', spec.joints, *joints or {})
     except ValueError as error:
         raise ValueError(f'{file}: {error}') from None
     for joint, own in (joints or {}).items():

@@ -67,12 +67,8 @@ class Gait:
         self.number = {name: i for i, name in enumerate(character.spec.joints)}
         self.link = {name: i for i, name in enumerate(character.spec.links)}
         for joints in (*gait.legs, *gait.targets.values()):
-            for name in joints:
-                if name not in self.number:
-                    raise ValueError(errors.unknown('joint', name, self.number))
-        for name in gait.feet:
-            if name not in self.link:
-                raise ValueError(errors.unknown('link', name, self.link))
+            errors.check_known('joint', self.number, *joints)
+        errors.check_known('link', self.link, *gait.feet)
         scope = character.mjcf_model.model
         self._sensors = [f'{scope}_{link}_ground' for link in character.spec.links]
         bodies = {body.name: body for body in character.bodies}

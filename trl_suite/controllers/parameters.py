@@ -141,10 +141,8 @@ def load(character: str, base_actions: str = 'default') -> Parameters:
     Raises:
       ValueError: the character has no gait, or `base_actions` is unknown.
     """
-    if base_actions not in BASE_ACTIONS:
-        raise ValueError(errors.unknown('base_actions', base_actions, BASE_ACTIONS))
-    if character not in available():
-        raise ValueError(errors.unknown('character with a gait', character, available()))
+    errors.check_known('base_actions', BASE_ACTIONS, base_actions)
+    errors.check_known('character with a gait', available(), character)
     text = (importlib.resources.files(__package__) / f'{character}.json').read_text()
     data = json.loads(text)
     if base_actions == 'original':
@@ -159,22 +157,17 @@ def read(data: dict[str, Any]) -> Parameters:
       ValueError: a vector has another length, a name is unknown, legs and feet do not fit, or no base
         action changes a parameter of the actions.
     """
-    if data['kind'] not in KINDS:
-        raise ValueError(errors.unknown('kind of gait', data['kind'], KINDS))
+    errors.check_known('kind of gait', KINDS, data['kind'])
     legs = tuple(tuple(leg) for leg in data['legs'])
     if len({len(leg) for leg in legs}) != 1 or len(legs) != len(data['feet']):
         raise ValueError('legs: expected the same number of joints for all, and one foot for each')
-    for name in data['targets']:
-        if name not in data['state_parameters']:
-            raise ValueError(errors.unknown('parameter of a state', name, data['state_parameters']))
+    errors.check_known('parameter of a state', data['state_parameters'], *data['targets'])
     names = (*data['misc'], *(f'{s}.{p}' for s in data['states'] for p in data['state_parameters']))
     sets = {name: np.array(values, float) for name, values in data['sets'].items()}
     for name, values in sets.items():
         if values.shape != (len(names),) or not np.isfinite(values).all():
             raise ValueError(f'set {name!r} needs {len(names)} finite numbers: {", ".join(names)}')
-    for name in (*data['fixed'], *data['absolute']):
-        if name not in names:
-            raise ValueError(errors.unknown('parameter', name, names))
+    errors.check_known('parameter', names, *(*data['fixed'], *data['absolute']))
     base = np.array(
         [(1 - blend) * sets[a] + blend * sets[b] for a, b, blend in data['base_actions']]
     )

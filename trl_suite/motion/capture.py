@@ -24,6 +24,7 @@ from trl_suite.motion.layout import LARGEST
 from trl_suite.util import errors
 from trl_suite.util.files import existing, read_text
 from trl_suite.util.libraries import library
+from trl_suite.util.options import checked
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
@@ -77,7 +78,7 @@ def read_bvh(
     """
     path = existing(path)
     axes = frame(forward, up)
-    _check_positive('unit', unit, 'metres')
+    checked('unit', unit, float, 'm', above=0)
     text = read_text(path)
     _check_bvh(path, text)
     pybvh = library('pybvh', 'trl_suite[clips]')
@@ -135,8 +136,8 @@ def read_amc(
     """
     path, skeleton = existing(path), existing(skeleton)
     axes = frame(forward, up)
-    _check_positive('rate', rate, 'frames per second')
-    _check_positive('unit', unit, 'metres')
+    checked('rate', rate, float, 'frames per second', above=0)
+    checked('unit', unit, float, 'm', above=0)
     bones, length, degrees = _skeleton(skeleton)
     frames = _frames(path, bones)
     if len(frames) * len(bones) > MOST_ROTATIONS:
@@ -184,11 +185,6 @@ def frame(forward: str, up: str) -> np.ndarray:
     if abs(rows[0] @ rows[1]) > 0:
         raise ValueError(f'forward is {forward!r} and up {up!r}; expected two axes')
     return np.stack([rows[0], np.cross(rows[1], rows[0]), rows[1]])
-
-
-def _check_positive(name: str, value: object, unit: str) -> None:
-    if not (errors.is_number(value) and 0 < value < np.inf):  # type: ignore[operator]
-        raise ValueError(f'{name} is {value!r}; expected a positive number of {unit}')
 
 
 def _euler(order: str, angles: np.ndarray, intrinsic: bool) -> np.ndarray:
@@ -317,8 +313,7 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
                 if words[0] not in named:
                     raise ValueError('a bone whose parent is not named above')
                 for child in values:
-                    if child not in bones:
-                        raise ValueError(errors.unknown('bone', child, bones))
+                    errors.check_known('bone', bones, child)
                     if child in named:
                         raise ValueError(f'{child!r} has a parent already')
                     bones[child]['parent'] = words[0]
@@ -353,9 +348,7 @@ def _order(values: Sequence[str]) -> str:
 def _dofs(values: Sequence[str]) -> list[str]:
     found = [value.lower() for value in values]
     known = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz', 'l')
-    for dof in found:
-        if dof not in known:
-            raise ValueError(errors.unknown('degree of freedom', dof, known))
+    errors.check_known('degree of freedom', known, *found)
     if len({*found}) < len(found):
         raise ValueError('one of them is given twice')
     return found
@@ -376,8 +369,7 @@ def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[s
             name, values = words[0], list(map(float, words[1:]))
             if not frames:
                 raise ValueError('expected the number of a frame before it')
-            if name not in bones:
-                raise ValueError(errors.unknown('bone', name, bones))
+            errors.check_known('bone', bones, name)
             expected = len(bones[name]['dof'])
             if len(values) != expected:
                 raise ValueError(f'{len(values)} numbers; expected {expected}')

@@ -282,6 +282,5 @@ def shipped(
     """
     if not isinstance(path_or_name, str) or path_or_name.endswith('.npz'):
         return pathlib.Path(path_or_name)
-    if path_or_name not in known:
-        raise ValueError(errors.unknown(kind, path_or_name, known))
+    errors.check_known(kind, known, path_or_name)
     return resources.directory('mocap') / f'{path_or_name}{suffix}.npz'

@@ -108,8 +108,7 @@ class Layout:
 
     def starts(self, joint: str) -> tuple[int, int]:
         """Returns the first column of a joint in a pose and in a velocity."""
-        if joint not in self.joints:
-            raise ValueError(errors.unknown('joint', joint, self.joints))
+        errors.check_known('joint', self.joints, joint)
         i = self.joints.index(joint)
         return int(self._pose_starts[i]), int(self._rate_starts[i])
 

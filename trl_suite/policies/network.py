@@ -99,8 +99,7 @@ class Policy:
                 raise ValueError(f'{name}: expected at least one name, each once; got {items}')
         if min(size for _, size in self.blocks) < 1:
             raise ValueError(f'blocks: expected positive sizes; got {_words(self.blocks)}')
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(errors.unknown('activation', self.activation, ACTIVATIONS))
+        errors.check_known('activation', ACTIVATIONS, self.activation)
         k, a = self.observation_size, len(self.actions)
         seen = k
         if self.places is not None:

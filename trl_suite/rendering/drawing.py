@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trl_suite.util import errors, interrupts
+from trl_suite.util.options import checked
 
 if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
@@ -109,10 +110,13 @@ def check_options(
     from trl_suite.rendering import overlays
 
     limits = model.vis.global_
-    errors.check_whole('height', height, 1, limits.offheight, ' pixels')
-    errors.check_whole('width', width, 1, limits.offwidth, ' pixels')
-    errors.check_kind('camera', camera, str | int)
-    errors.check_kind('ghost', ghost, bool)
+    for name, value, most in (
+        ('height', height, limits.offheight),
+        ('width', width, limits.offwidth),
+    ):
+        checked(name, value, int, 'pixels', at_least=1, at_most=most)
+    checked('camera', camera, str | int)
+    checked('ghost', ghost, bool)
     overlays.of_task(task, ghost)
     return _camera(model, camera)
 

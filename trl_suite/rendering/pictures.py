@@ -15,9 +15,9 @@ import tqdm
 from trl_suite import terrain as terrains
 from trl_suite.rendering.video import check_image
 from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
-from trl_suite.util import errors
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
+from trl_suite.util.options import checked
 
 if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
@@ -101,12 +101,10 @@ def plot_terrain(
     """
     terrain = terrains.load(terrain)
     target = check_path(path, IMAGE_SUFFIXES)
-    errors.check_whole('draws', draws, 1, MOST_DRAWS)
+    draws = checked('draws', draws, int, at_least=1, at_most=MOST_DRAWS)
     longest = MAX_SPAN if terrain.spatial else 10_000.0
-    if not 0 < length <= longest:
-        raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
-    if seed < 0:
-        raise ValueError(f'seed is {seed}; expected 0 or more')
+    checked('length', length, float, 'm', above=0, at_most=longest)
+    checked('seed', seed, int, at_least=0)
     # `Figure` needs no display and does not affect the user's pyplot.
     make = library('matplotlib.figure', 'trl_suite[video]').Figure
     if terrain.spatial:
@@ -220,8 +218,7 @@ def height_map(
             f'the task {type(task).__name__} observes no map of {SAMPLES} x {SAMPLES} heights; '
             "3D imitation and footsteps observe one with the option terrain_observation='height'"
         )
-    if not 0 < reach < np.inf:
-        raise ValueError(f'reach is {reach}; expected a positive number of metres')
+    checked('reach', reach, float, 'm', above=0)
     # Lines are ordered from the left, samples of a line from behind.
     heights = task.observation[0, part].reshape(SAMPLES, SAMPLES).T[::-1]
     share = np.clip(heights / reach, -1, 1)[..., None]

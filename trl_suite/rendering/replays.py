@@ -10,11 +10,10 @@ import html
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.rendering.pictures import REPLAY_SUFFIXES
 from trl_suite.util.files import Path, check_path, replacing
+from trl_suite.util.options import checked
 
 if TYPE_CHECKING:
     from dm_control import composer
@@ -52,8 +51,7 @@ class Replay:
           OSError: the file cannot be written.
         """
         self._path = None if path is None else check_path(path, REPLAY_SUFFIXES)
-        if not 0 < fps < np.inf:
-            raise ValueError(f'fps is {fps}; expected a positive number')
+        checked('fps', fps, float, above=0)
         self._overlays = overlays.of_task(environment.task, ghost)
         web_server.load_viser()
         self._environment, self._seconds = environment, 1 / fps

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.util import errors, interrupts
+from trl_suite.util import interrupts
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
+from trl_suite.util.options import checked
 
 CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
 VIDEO_SUFFIXES = ('.mp4', '.gif')
@@ -53,9 +54,7 @@ class Video:
 
     def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
         self._path = check_path(path, VIDEO_SUFFIXES)
-        if not (errors.is_number(fps) and 0 < fps < np.inf):
-            raise ValueError(f'fps is {fps}; expected a positive number')
-        self._fps = fps
+        self._fps = checked('fps', fps, float, above=0)
         self._images: list[Any] = []  # of a .gif
         self._h264 = self._path.suffix.lower() == '.mp4'
         module = 'imageio_ffmpeg' if self._h264 else 'PIL.Image'

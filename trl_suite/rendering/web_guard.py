@@ -24,6 +24,7 @@ import websockets.asyncio.server
 from viser import _messages
 
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 CLIENTS = 16  # connected at the same time
 LARGEST_MESSAGE, LARGEST_UPLOAD = 2**20, 2**25  # bytes; files arrive in parts of 2**19
@@ -212,14 +213,9 @@ def check_value(control: Any, value: Any) -> None:
         if value not in control.options:
             raise ValueError(errors.unknown(name, str(value)[:LONGEST], control.options))
     elif hasattr(control, 'min'):
-        if isinstance(control.value, int):
-            errors.check_whole(name, value, control.min, control.max)
-        errors.check_kind(name, value, float)
-        if not control.min <= value <= control.max:
-            raise ValueError(
-                f'{name} is {value}; expected a number from {control.min} to {control.max}'
-            )
+        kind = int if isinstance(control.value, int) else float
+        checked(name, value, kind, at_least=control.min, at_most=control.max)
     elif isinstance(control.value, bool):
-        errors.check_kind(name, value, bool)
+        checked(name, value, bool)
     else:
         raise ValueError(f'{name} takes no value')

@@ -8,8 +8,8 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from trl_suite.util import errors
 from trl_suite.util.libraries import library
+from trl_suite.util.options import checked
 
 PORTS, LAST_PORT = 1000, 65535  # number of ports tried; the largest port
 
@@ -46,8 +46,8 @@ def start_server(
     viser = load_viser()
     from trl_suite.rendering import web_guard  # imports viser, too
 
-    errors.check_whole('port', port, 0, LAST_PORT)
-    port = _free_port(host, int(port))  # where there is none, viser would wait forever
+    port = checked('port', port, int, at_least=0, at_most=LAST_PORT)
+    port = _free_port(host, port)  # where there is none, viser would wait forever
     guard = web_guard.Guard(token, report)
     with _silent_viser(), guard.installed():
         server = viser.ViserServer(host, port, verbose=False)

@@ -15,6 +15,7 @@ from trl_suite.characters import CharacterSpec
 from trl_suite.motion import Capture, Clip, quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 STRAIGHT = 0.2  # m; a motion with a larger displacement is rotated to +x by it, not by its heading
 SINKING = 0.05  # fraction of frames that may penetrate the ground; captured heights are inexact
@@ -75,11 +76,8 @@ def counterparts(
     """
     ours, theirs = ('root', *joints), _joints(motion)
     chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)
-    for our, their in chosen.items():
-        if our not in ours:
-            raise ValueError(errors.unknown('joint of the character', our, ours))
-        if their not in theirs:
-            raise ValueError(errors.unknown('joint of the motion', their, theirs))
+    errors.check_known('joint of the character', ours, *chosen)
+    errors.check_known('joint of the motion', theirs, *chosen.values())
     if 'root' not in chosen or len(chosen) < 2:
         raise ValueError(
             f'motion {motion.name!r}: the root, or all other joints, have no counterpart; pass a '
@@ -126,8 +124,7 @@ def retarget(
         if (own.root, own.joints, own.sizes) == (layout.root, layout.joints, layout.sizes):
             return motion
     theirs, chosen = _joints(motion), counterparts(motion, layout.joints, joint_map)
-    if scale is not None and not (errors.is_number(scale) and 0 < scale < np.inf):
-        raise ValueError(f'scale is {scale}; expected a positive number')
+    checked('scale', scale, float | None, above=0)
     if isinstance(motion, Capture):
         path, turns = motion.positions, motion.rotations[:, theirs.index(chosen['root'])]
         size = _limbs(figure, motion, chosen) if scale is None else scale

@@ -73,8 +73,7 @@ def get(name: str) -> Sequence:
     Raises:
       ValueError: an unknown name; the message has the closest matches.
     """
-    if name not in SEQUENCES:
-        raise ValueError(errors.unknown('sequence', name, SEQUENCES))
+    errors.check_known('sequence', SEQUENCES, name)
     return SEQUENCES[name]
 
 

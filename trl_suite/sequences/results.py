@@ -24,17 +24,19 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from trl_suite.sequences import stage
 from trl_suite.sequences.catalogue import BUDGETS, EPISODES, SEEDS, SEQUENCES, Sequence
 from trl_suite.sequences.metrics import metrics
 from trl_suite.util import errors, files
+from trl_suite.util.options import checked
 
 FORMAT = 'trl_suite sequence 1'
-SETTINGS = {  # with their types
-    'learner': str, 'sequence': str, 'ids': list, 'budget': int, 'episodes': int, 'seed': int,
+SETTINGS: Mapping[str, tuple[Any, dict[str, float]]] = {  # with their types and bounds
+    'learner': (str, {}), 'sequence': (str, {}), 'ids': (list[str], {}),
+    'budget': (int, {'at_least': 1}), 'episodes': (int, {'at_least': 1}), 'seed': (int, {'at_least': 0}),
 }  # fmt: skip
 ROWS = ('scores', 'samples', 'curves', 'seconds')  # lists with one entry per stage
 MADE_WITH = ('mujoco', 'cpu')
@@ -80,24 +82,17 @@ def check(result: Any, complete: bool = True) -> None:
     if not isinstance(result, dict):
         raise ValueError(f'a {type(result).__name__}; expected an object with {", ".join(FIELDS)}')
     known = (*FIELDS, 'metrics', *MADE_WITH)
-    for name in result:
-        if name not in known:
-            raise ValueError(errors.unknown('field', name, known))
+    errors.check_known('field', known, *result)
     for name in (*FIELDS, 'metrics') if complete else FIELDS:
         if name not in result:
             hint = '; the run has not ended' if name == 'metrics' else ''
             raise ValueError(f'{name} is missing{hint}')
     if result['format'] != FORMAT:
         raise ValueError(f'format is {result["format"]!r}; expected {FORMAT!r}')
-    for name, kind in SETTINGS.items():
-        errors.check_kind(name, result[name], kind)
+    for name, (kind, bounds) in SETTINGS.items():
+        checked(name, result[name], kind, **bounds)
     for name in MADE_WITH:
-        errors.check_kind(name, result.get(name, ''), str)
-    if not isinstance(result['ids'], list):
-        raise ValueError(f'ids is {result["ids"]!r}; expected a list of strings')
-    for name, least in (('budget', 1), ('episodes', 1), ('seed', 0)):
-        if result[name] < least:
-            raise ValueError(f'{name} is {result[name]}; expected {least} or more')
+        checked(name, result.get(name, ''), str)
     name, ids = result['sequence'], tuple(result['ids'])
     sequence = SEQUENCES.get(name) or Sequence(name, ids)
     if ids != sequence.ids:
@@ -114,19 +109,19 @@ def check(result: Any, complete: bool = True) -> None:
 
 def _check_rows(result: dict[str, Any], tasks: int, complete: bool) -> None:
     """Checks numbers and shapes of everything that was measured."""
-    _check_numbers('initial', result['initial'], tasks, high=1.0)
+    _check_numbers('initial', result['initial'], tasks, at_most=1)
     stages = tasks if complete else min(len(result['scores']), tasks)
     for name in ROWS:
         if not isinstance(result[name], list) or len(result[name]) != stages:
             found = len(result[name]) if isinstance(result[name], list) else result[name]
             raise ValueError(f'{name}: {found} stages; expected {stages}')
-    _check_numbers('seconds', result['seconds'], stages, low=0.0)
+    _check_numbers('seconds', result['seconds'], stages, at_least=0)
     for i in range(stages):
-        _check_numbers(f'scores[{i}]', result['scores'][i], tasks, high=1.0)
-        curve = result['curves'][i]
-        _check_numbers(f'curves[{i}]', curve, stage.POINTS, high=1.0, gaps=True)
+        _check_numbers(f'scores[{i}]', result['scores'][i], tasks, at_most=1)
+        curve, kind = result['curves'][i], float | None  # with gaps
+        _check_numbers(f'curves[{i}]', curve, stage.POINTS, kind, at_most=1)
         row = result['samples'][i]
-        _check_numbers(f'samples[{i}]', row, tasks, low=0.0)
+        _check_numbers(f'samples[{i}]', row, tasks, at_least=0)
         if any(value != int(value) for value in row) or sum(row) > result['budget']:
             raise ValueError(
                 f'samples[{i}] is {row}, in total {sum(row)}; expected whole numbers with a total of '
@@ -134,24 +129,12 @@ def _check_rows(result: dict[str, Any], tasks: int, complete: bool) -> None:
             )
 
 
-def _check_numbers(
-    name: str, values: Any, count: int, low: float = -math.inf, high: float = math.inf,
-    gaps: bool = False,
-) -> None:  # fmt: skip
+def _check_numbers(name: str, values: Any, count: int, kind: Any = float, **bounds: float) -> None:
     if not isinstance(values, list) or len(values) != count:
         found = f'{len(values)} entries' if isinstance(values, list) else repr(values)
         raise ValueError(f'{name}: {found}; expected {count} numbers')
     for i, value in enumerate(values):
-        if gaps and value is None:
-            continue
-        errors.check_kind(f'{name}[{i}]', value, float)
-        if not (math.isfinite(value) and low <= value <= high):
-            bounds = ' '.join(
-                f'{word} {bound:g}'
-                for word, bound in (('of at least', low), ('of at most', high))
-                if math.isfinite(bound)
-            )
-            raise ValueError(f'{name}[{i}] is {value}; expected a finite number {bounds}'.rstrip())
+        checked(f'{name}[{i}]', value, kind, **bounds)
 
 
 def _check_metrics(result: dict[str, Any]) -> None:
@@ -160,7 +143,7 @@ def _check_metrics(result: dict[str, Any]) -> None:
     if not isinstance(found, dict) or set(found) != set(expected):
         raise ValueError(f'metrics: expected {", ".join(expected)}')
     for name, value in expected.items():
-        errors.check_kind(f'metrics.{name}', found[name], float)
+        checked(f'metrics.{name}', found[name], float)
         if not math.isclose(found[name], value, abs_tol=1e-9):
             raise ValueError(
                 f'metrics.{name} is {found[name]}; expected {value}, that of scores and initial'

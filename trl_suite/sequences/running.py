@@ -19,7 +19,8 @@ from trl_suite.sequences import results
 from trl_suite.sequences.catalogue import BUDGETS, EPISODES, Sequence, get, test_seeds
 from trl_suite.sequences.metrics import metrics
 from trl_suite.sequences.stage import Stage
-from trl_suite.util import errors, files, machine
+from trl_suite.util import files, machine
+from trl_suite.util.options import checked
 
 SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
 
@@ -124,11 +125,11 @@ def run(
       OSError: a file cannot be read or written.
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
-    errors.check_whole('budget', budget, 1, 2**53)
-    errors.check_whole('episodes', episodes, 1, evaluation.MOST_EPISODES)
-    errors.check_whole('seed', seed, 0, 2**53)
+    budget = checked('budget', budget, int, at_least=1, at_most=2**53)
+    episodes = checked('episodes', episodes, int, at_least=1, at_most=evaluation.MOST_EPISODES)
+    seed = checked('seed', seed, int, at_least=0, at_most=2**53)
     stages = len(sequence) if stages is None else stages
-    errors.check_whole('stages', stages, 1, len(sequence))
+    stages = checked('stages', stages, int, at_least=1, at_most=len(sequence))
     kind = type(learner)
     if not isinstance(learner, Learner):
         raise TypeError(f'learner is a {kind.__name__}; expected the methods train and policy')

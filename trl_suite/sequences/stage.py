@@ -74,8 +74,7 @@ class Stage:
           ValueError: an environment that is not in the sequence, or invalid options.
         """
         id = self.id if id is None else catalogue.find(id).id
-        if id not in self.ids:
-            raise ValueError(errors.unknown('environment of the sequence', id, self.ids))
+        errors.check_known('environment of the sequence', self.ids, id)
         if 'seed' in options:
             raise ValueError('seed: expected none, since the stage draws it from that of the run')
         seeds = train_seeds(num_envs, (self.seed, self.number, next(self._made)))

@@ -156,8 +156,7 @@ class Session:
         Raises:
           ValueError: if the direction is unknown.
         """
-        if direction not in PUSHES:
-            raise ValueError(errors.unknown('direction', direction, PUSHES))
+        errors.check_known('direction', PUSHES, direction)
         self._push = speed * np.array(PUSHES[direction])
 
     def _apply_push(self) -> None:
