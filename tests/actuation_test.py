@@ -224,7 +224,7 @@ class ActionMapTest(parameterized.TestCase):
         del leg.range
         leg.limited = False
         with self.assertRaisesRegex(
-            ValueError, "'hopper': action_offset and action_scale must be finite"
+            ValueError, "action_scale of 'hopper': inf at .*; expected finite"
         ):
             actuation.add(character, 'position', TIMESTEP)
 

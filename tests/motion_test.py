@@ -273,7 +273,11 @@ class MirrorTest(absltest.TestCase):
 
 class ConstructionTest(parameterized.TestCase):
     @parameterized.named_parameters(
-        ('one_frame', {'times': [0], 'poses': np.zeros((1, 5))}, 'times: at least 2'),
+        (
+            'one_frame',
+            {'times': [0], 'poses': np.zeros((1, 5))},
+            r'times: has shape \(1,\); expected 2 or more',
+        ),
         ('late_start', {'times': np.linspace(0.1, 1, 9)}, 'times: must start at 0'),
         (
             'standing_time',
@@ -285,11 +289,23 @@ class ConstructionTest(parameterized.TestCase):
             {'times': [0, 1e-320, *range(1, 8)]},
             'times: .* increase by at least 1e-06 s',
         ),
-        ('infinite_time', {'times': [*range(8), np.inf]}, r'times: not finite at \[8\]'),
-        ('too_few_columns', {'poses': np.zeros((9, 4))}, r'poses: shape is \(9, 4\).*\(9, 5\)'),
-        ('no_table', {'poses': np.zeros(9)}, 'poses: shape'),
-        ('ragged', {'poses': [[1, 2], [3]]}, 'poses: an array of numbers'),
-        ('not_finite', {'poses': np.full((9, 5), np.nan)}, r'poses: not finite at \[0, 0\]'),
+        (
+            'infinite_time',
+            {'times': [*range(8), np.inf]},
+            r'times: inf at \[8\]; expected finite numbers of at most 1e\+06',
+        ),
+        (
+            'too_few_columns',
+            {'poses': np.zeros((9, 4))},
+            r'poses: has shape \(9, 4\); expected \(9, 5\)',
+        ),
+        ('no_table', {'poses': np.zeros(9)}, 'poses: has shape'),
+        ('ragged', {'poses': [[1, 2], [3]]}, 'poses: expected an array of numbers'),
+        (
+            'not_finite',
+            {'poses': np.full((9, 5), np.nan)},
+            r'poses: nan at \[0, 0\]; expected finite',
+        ),
         ('unknown_root', {'root': 'plnar'}, "root: unknown root 'plnar'.*'planar'"),
         ('size', {'sizes': (1, 3)}, 'sizes'),
         ('sizes', {'sizes': (1,)}, 'sizes: 1 for 2 joints'),
@@ -407,7 +423,7 @@ class FileTest(parameterized.TestCase):
         ('axes', 'root', np.array(['planar']), "'root' has type"),
         ('sizes', 'sizes', np.array([1.0, 1.0]), "'sizes' has type"),
         ('content', 'times', np.arange(9.0) + 1, 'times: must start at 0'),
-        ('numbers', 'poses', np.array(['a', 'b']), 'poses: an array of numbers'),
+        ('numbers', 'poses', np.array(['a', 'b']), 'poses: expected an array of numbers'),
     )
     def test_malformed_field(self, field, value, message):
         path = self.folder / 'bad.npz'
@@ -501,11 +517,15 @@ class StepsTest(parameterized.TestCase):
         np.testing.assert_array_equal(library.select(query, np.ones(7)), (0, 1, 0))
 
     @parameterized.named_parameters(
-        ('no_clips', {'poses': np.zeros((0, 7, 17))}, 'poses: one or more'),
-        ('one_clip', {'poses': np.zeros((7, 17))}, 'poses: one or more'),
-        ('labels', {'labels': np.zeros((2, 2))}, r'labels: shape is \(2, 2\), needed \(2, 3\)'),
-        ('previous', {'previous': np.full((2, 3), np.nan)}, 'previous: not finite'),
-        ('features', {'features': [['a'] * 7] * 2}, 'features: an array of numbers'),
+        ('no_clips', {'poses': np.zeros((0, 7, 17))}, 'poses: has shape .* expected .k, n, d.'),
+        ('one_clip', {'poses': np.zeros((7, 17))}, 'poses: has shape .* expected .k, n, d.'),
+        ('labels', {'labels': np.zeros((2, 2))}, r'labels: has shape \(2, 2\); expected \(2, 3\)'),
+        (
+            'previous',
+            {'previous': np.full((2, 3), np.nan)},
+            r'previous: nan at \[0, 0\]; expected finite',
+        ),
+        ('features', {'features': [['a'] * 7] * 2}, 'features: expected an array of numbers'),
     )
     def test_invalid_arguments_are_rejected(self, change, message):
         with self.assertRaisesRegex(ValueError, f"steps 'steps', {message}"):

@@ -106,9 +106,13 @@ class MetricsTest(parameterized.TestCase):
         self.assertLess(sequences.forgetting(scores), 0)
 
     def test_scores_whose_metrics_would_be_infinite(self):
-        with self.assertRaisesRegex(ValueError, 'scores: expected numbers of at most 1e.100'):
+        with self.assertRaisesRegex(
+            ValueError, r'scores: -1e\+308 at \[0, 0\]; expected .* numbers of at most 1e.100'
+        ):
             sequences.metrics(np.full((3, 3), -1e308), [0.0] * 3)
-        with self.assertRaisesRegex(ValueError, 'initial: expected numbers of at most 1e.100'):
+        with self.assertRaisesRegex(
+            ValueError, r'initial: 1e\+308 at \[1\]; expected .* of at most 1e.100'
+        ):
             sequences.metrics(self.SCORES, [0.0, 1e308, 0.0])
 
     def test_values_that_are_not_needed_may_be_missing(self):

@@ -208,20 +208,19 @@ def _add_position(
             for joint, size in zip(joints, character.dofs, strict=True)
         ]).astype(float)  # fmt: skip
     else:
-        middle = errors.floats('action_offset', action_offset)
+        middle = errors.floats('action_offset', action_offset).copy()
     if action_scale is None:
         slide = np.ptp(character.joint_ranges, axis=1) / 2
         # Joints with a small range get the original's scale.
         original = ORIGINAL_SPAN * np.ptp(original_ranges(character), axis=1)
         turn = np.minimum(POSITION_SCALE, original)
         action_scale = _spread(character, np.where(character.prismatic, slide, turn))
-    reach = np.broadcast_to(errors.floats('action_scale', action_scale), len(names)).copy()
-    if middle.shape != (len(names),) or not (
-        np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
-    ):
+    scale = errors.floats(f'action_scale of {character.spec.name!r}', action_scale)
+    reach = np.broadcast_to(scale, len(names)).copy()
+    if middle.shape != (len(names),) or not np.all(reach > 0):
         raise ValueError(
-            f'position control of {character.spec.name!r}: action_offset and action_scale must be '
-            f'finite, action_scale positive, and both broadcast to ({len(names)},)'
+            f'position control of {character.spec.name!r}: action_scale must be positive, and '
+            f'action_offset and action_scale broadcast to ({len(names)},)'
         )
     quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')

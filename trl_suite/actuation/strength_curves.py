@@ -144,14 +144,11 @@ def _curve(joint: str, entry: Any) -> Curve:
     owner = f'torque_pose[{joint!r}]'
     if not isinstance(entry, Mapping) or set(entry) != set(_FIELDS):
         raise ValueError(f'{owner} is {entry!r}; expected a dict with {", ".join(_FIELDS)}')
-    try:
-        angle, positive, negative = (np.array(entry[name], float) for name in _FIELDS)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f'{owner} is {entry!r}; expected lists of numbers') from None
+    angle, positive, negative = (errors.floats(f'{owner}: {name}', entry[name]) for name in _FIELDS)
     if angle.ndim != 1 or len(angle) < 2 or not angle.shape == positive.shape == negative.shape:
         raise ValueError(f'{owner}: expected lists of equal length, at least 2')
-    if not (np.isfinite(angle).all() and (np.diff(angle) > 0).all()):
-        raise ValueError(f'{owner}: angle is {angle}; expected finite numbers in ascending order')
+    if not (np.diff(angle) > 0).all():
+        raise ValueError(f'{owner}: angle is {angle}; expected numbers in ascending order')
     for name, factors in (('positive', positive), ('negative', negative)):
         if not ((factors >= 0) & (factors <= MOST)).all():
             raise ValueError(f'{owner}: {name} is {factors}; expected numbers from 0 to {MOST:g}')

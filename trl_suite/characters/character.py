@@ -12,6 +12,7 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from trl_suite.util import errors, resources
+from trl_suite.util.options import checked
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
 DIGITS = 6  # decimals of the values in a fingerprint
@@ -48,11 +49,10 @@ class Joint:
     def __post_init__(self) -> None:
         for name in ('kp', 'kd', 'weight', 'armature', 'target', 'original_range'):
             value = getattr(self, name)
-            least = -np.inf if name in ('target', 'original_range') else 0.0
-            numbers = errors.floats(f'{name} of a joint', 0.0 if value is None else value)
-            if not (np.isfinite(numbers).all() and numbers.min() >= least):
-                expected = 'finite numbers' if least else 'a finite number, 0 or more'
-                raise ValueError(f'{name} of a joint is {value!r}; expected {expected}')
+            if name in ('target', 'original_range'):
+                errors.floats(f'{name} of a joint', 0.0 if value is None else value)
+            else:
+                checked(f'{name} of a joint', value, float, at_least=0)
 
 
 @dataclasses.dataclass(frozen=True)

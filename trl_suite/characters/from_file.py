@@ -51,6 +51,7 @@ from trl_suite.util import errors, limited
 from trl_suite.util.files import check_size, existing
 from trl_suite.util.options import checked
 
+Names = Collection[str] | None
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
 _DIVERGED = [
@@ -118,15 +119,12 @@ def from_file(
     for option, value, kind in (
         ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
         ('description', description, str), ('balance_inertia', balance_inertia, bool),
+        ('end_effectors', end_effectors, Names), ('fall_links', fall_links, Names),
+        ('stumble_exempt', stumble_exempt, Names),
     ):  # fmt: skip
         checked(option, value, kind)
-    for what, names, least in (
-        ('end effectors', end_effectors, 1), ('fall links', fall_links, 0),
-        ('stumble-exempt links', stumble_exempt, 0),
-    ):  # fmt: skip
-        if names is not None and not _is_names(names, least):
-            expected = 'one name or more' if least else 'names'
-            raise ValueError(f'{what} are {names!r}; expected a sequence of {expected}')
+    if end_effectors is not None and not len(end_effectors):
+        raise ValueError(f'end_effectors is {end_effectors!r}; expected one name or more')
     if name == '':
         raise ValueError("name is ''; expected a name, or None for that of the file")
     if joints is not None and not isinstance(joints, Mapping):
@@ -154,16 +152,6 @@ def from_file(
         if not isinstance(own, Joint):
             raise TypeError(f'joints[{joint!r}] is {own!r}; expected a characters.Joint')
     return dataclasses.replace(spec, joints={**spec.joints, **(joints or {})})
-
-
-def _is_names(names: object, least: int) -> bool:
-    """Whether an argument is a collection of at least so many names."""
-    return (
-        isinstance(names, Collection)
-        and not isinstance(names, (str, bytes))
-        and len(names) >= least
-        and all(isinstance(name, str) for name in names)
-    )
 
 
 def _read(
@@ -254,12 +242,9 @@ def _check_physics(spec: CharacterSpec) -> None:
 
 def _rotation(turn: Sequence[float]) -> np.ndarray:
     """Returns a unit quaternion."""
-    try:
-        found = np.array(turn, float)
-    except (TypeError, ValueError, OverflowError):
-        found = np.zeros(0)
+    found = errors.floats('turn, a quaternion wxyz', turn, (4,))
     length = np.linalg.norm(found)
-    if found.shape != (4,) or not 0 < length < np.inf:
+    if not 0 < length < np.inf:
         raise ValueError(
             f'turn is {turn!r}; expected a quaternion wxyz, such as (0.7071, 0.7071, 0, 0)'
         )

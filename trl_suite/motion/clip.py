@@ -69,51 +69,32 @@ class Clip:
     turning: bool = False
 
     def __post_init__(self) -> None:
-        for field in ('times', 'poses'):
-            try:
-                array = np.array(getattr(self, field), dtype=float)  # a copy, made read-only
-            except (TypeError, ValueError, OverflowError) as error:
-                raise self._error(field, f'an array of numbers is needed ({error})') from None
-            array.setflags(write=False)
-            object.__setattr__(self, field, array)
-        object.__setattr__(self, 'joints', tuple(map(str, self.joints)))
-        object.__setattr__(self, 'sizes', tuple(map(int, self.sizes)))
-        object.__setattr__(self, 'loop', bool(self.loop))
-        object.__setattr__(self, 'turning', bool(self.turning))
-        self._check()
-
-    def _error(self, field: str, what: str) -> ValueError:
-        return ValueError(f'clip {self.name!r}, {field}: {what}')
-
-    def _check(self) -> None:
+        put, what = functools.partial(object.__setattr__, self), f'clip {self.name!r}'
+        put('joints', tuple(map(str, self.joints)))
+        put('sizes', tuple(map(int, self.sizes)))
+        put('loop', bool(self.loop))
+        put('turning', bool(self.turning))
         try:
             columns = self.layout.columns
         except ValueError as error:
-            raise ValueError(f'clip {self.name!r}, {error}') from None
+            raise ValueError(f'{what}, {error}') from None
         if self.turning and self.root == 'planar':
-            raise self._error('turning', 'a planar root has no heading')
-        if self.times.ndim != 1 or self.times.size < 2:
-            raise self._error('times', f'at least 2 are needed, shape is {self.times.shape}')
-        if self.poses.shape != (self.times.size, columns):
-            raise self._error(
-                'poses', f'shape is {self.poses.shape}, needed ({self.times.size}, {columns})'
-            )
-        for field in ('times', 'poses'):
-            values = getattr(self, field)
-            bad = np.argwhere(~(np.abs(values) < LARGEST))  # NaN, too
-            if bad.size:
-                what = 'too large' if np.isfinite(values[tuple(bad[0])]) else 'not finite'
-                raise self._error(field, f'{what} at {bad[0].tolist()}')
+            raise ValueError(f'{what}, turning: a planar root has no heading')
+        put('times', errors.floats(f'{what}, times', self.times, most=LARGEST))
+        n = self.times.size
+        if self.times.ndim != 1 or n < 2:
+            raise ValueError(f'{what}, times: has shape {self.times.shape}; expected 2 or more')
+        put('poses', errors.floats(f'{what}, poses', self.poses, (n, columns), LARGEST))
         if self.times[0] != 0 or np.any(np.diff(self.times) < SHORTEST):
-            raise self._error('times', f'must start at 0 and increase by at least {SHORTEST:g} s')
+            raise ValueError(
+                f'{what}, times: must start at 0 and increase by at least {SHORTEST:g} s'
+            )
         for q, _ in self.layout.rotations:
             norms = np.linalg.norm(self.poses[:, q : q + 4], axis=1)
-            bad = np.argwhere(np.abs(norms - 1) > _UNIT_TOLERANCE)
-            if bad.size:
-                frame = int(bad[0, 0])
-                raise self._error(
-                    'poses',
-                    f'quaternion at column {q} of frame {frame} has length {norms[frame]:.6g}',
+            for frame in np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE):
+                raise ValueError(
+                    f'{what}, poses: quaternion at column {q} of frame {frame} has length '
+                    f'{norms[frame]:.6g}'
                 )
 
     @functools.cached_property

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from trl_suite.motion import quaternion
 from trl_suite.motion.clip import STEPS_SUFFIX, VELOCITY_STEP, Clip, shipped
 from trl_suite.motion.layout import LARGEST, Layout
-from trl_suite.util import archive, resources
+from trl_suite.util import archive, errors, resources
 
 FEATURES = (
     *('right foot ahead of the root', 'right foot left of the root'),
@@ -79,28 +79,18 @@ class Steps:
     description: str = ''
 
     def __post_init__(self) -> None:
-        for field in ('times', 'poses', 'labels', 'previous', 'features'):
-            try:
-                array = np.array(getattr(self, field), dtype=float)  # a copy, made read-only
-            except (TypeError, ValueError, OverflowError) as error:
-                raise self._error(field, f'an array of numbers is needed ({error})') from None
-            array.setflags(write=False)
-            object.__setattr__(self, field, array)
-        object.__setattr__(self, 'joints', tuple(map(str, self.joints)))
-        object.__setattr__(self, 'sizes', tuple(map(int, self.sizes)))
+        put, what = functools.partial(object.__setattr__, self), f'steps {self.name!r}'
+        put('joints', tuple(map(str, self.joints)))
+        put('sizes', tuple(map(int, self.sizes)))
+        put('times', errors.floats(f'{what}, times', self.times))
+        put('poses', errors.floats(f'{what}, poses', self.poses))
         if self.poses.ndim != 3 or not len(self.poses):
-            raise self._error('poses', f'one or more clips are needed, shape {self.poses.shape}')
+            raise ValueError(f'{what}, poses: has shape {self.poses.shape}; expected (k, n, d)')
         for field, columns in (('labels', 3), ('previous', 3), ('features', len(FEATURES))):
             array, shape = getattr(self, field), (len(self), columns)
-            if array.shape != shape:
-                raise self._error(field, f'shape is {array.shape}, needed {shape}')
-            if not (np.abs(array) < LARGEST).all():
-                raise self._error(field, 'not finite, or too large')
+            put(field, errors.floats(f'{what}, {field}', array, shape, LARGEST))
         for i in range(len(self)):
             self.clip(i)  # checks the other fields
-
-    def _error(self, field: str, what: str) -> ValueError:
-        return ValueError(f'steps {self.name!r}, {field}: {what}')
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 
+from trl_suite.util import errors
+
 LARGEST = float(np.finfo(np.float32).max)  # bound of sums
 
 
-def array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns a read-only copy of an array, float32.
-
-    Raises:
-      ValueError: not finite numbers of this shape; the message has the name.
-    """
-    try:
-        with np.errstate(over='ignore'):
-            copied = np.array(value, dtype=np.float32, order='C')
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
-    if copied.shape != shape:
-        raise ValueError(f'{name}: has shape {copied.shape}; expected {shape}')
-    if not np.isfinite(copied).all():
-        raise ValueError(f'{name}: has numbers that are not finite')
-    copied.setflags(write=False)
-    return copied
+array = functools.partial(errors.floats, dtype=np.float32)
 
 
 def stack(name: str, weight: Any, axes: int) -> tuple[int, ...]:

@@ -119,10 +119,7 @@ def _matrix(scores: ArrayLike) -> np.ndarray:
 
 
 def _numbers(name: str, values: ArrayLike) -> np.ndarray:
-    found = errors.floats(name, values)
-    if (np.abs(found) > LARGEST).any():
-        raise ValueError(f'{name}: expected numbers of at most {LARGEST:g}')
-    return found
+    return errors.floats(name, values, most=LARGEST, missing=True)
 
 
 def _mean(values: np.ndarray) -> float:

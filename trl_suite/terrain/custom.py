@@ -176,8 +176,6 @@ def from_heights(
             f'{name}: heights have shape {heights.shape}; expected (k,) or (k, m), 2 or more along '
             f'each axis and no more than {LARGEST:g} in all'
         )
-    if not np.isfinite(heights).all():
-        raise ValueError(f'{name}: heights must be finite; the one at {_where(heights)} is not')
     checked(f'{name}: spacing', spacing, float, 'm', above=0)
     corner = -(np.array(heights.shape) // 2) if first is None else np.atleast_1d(first)
     if corner.shape != (heights.ndim,):
@@ -201,10 +199,6 @@ def from_heights(
     return CustomTerrain(
         name, type_name, ({'StartSpan': start_span},), (again, (heights, spacing, name))
     )
-
-
-def _where(heights: np.ndarray) -> list[int]:
-    return np.argwhere(~np.isfinite(heights))[0].tolist()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,7 +258,8 @@ def from_image(
       ImportError: Pillow is not installed.
     """
     file = existing(path, tuple(IMAGES))
-    if not np.isfinite(errors.floats(f'{file}: low and high', [low, high])).all() or low == high:
+    errors.floats(f'{file}: low and high', [low, high])
+    if low == high:
         raise ValueError(f'{file}: black is {low} m and white {high} m; expected two heights')
     pixels = _pixels(file)
     if not np.issubdtype(pixels.dtype, np.integer) and pixels.dtype != bool:

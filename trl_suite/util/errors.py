@@ -54,17 +54,37 @@ def is_number(value: object) -> bool:
         return False
 
 
-def floats(name: str, value: Any) -> np.ndarray:
-    """Returns a new array of floats.
+def floats(
+    name: str, value: Any, shape: tuple[int, ...] | None = None, most: float = math.inf,
+    dtype: Any = float, missing: bool = False,
+) -> np.ndarray:  # fmt: skip
+    """Returns a read-only copy of an array of finite numbers.
+
+    Args:
+      name: its name, for messages.
+      value: a number or an array of numbers.
+      shape: expected shape; None for any.
+      most: largest magnitude.
+      dtype: type of floats of the copy.
+      missing: whether numbers may be NaN.
 
     Raises:
-      ValueError: the value is no number or array of numbers, or has one that is too large for a float;
-        the message has the name.
+      ValueError: anything else; the message has the name, and the index of a number.
     """
     try:
-        return np.array(value, float)
+        with np.errstate(over='ignore'):
+            array = np.array(value, dtype, order='C')
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f'{name}: expected a number, or an array of numbers: {error}') from None
+        raise ValueError(f'{name}: expected an array of numbers: {error}') from None
+    if shape is not None and array.shape != shape:
+        raise ValueError(f'{name}: has shape {array.shape}; expected {shape}')
+    good = np.isfinite(array) & (np.abs(array) <= most)
+    if not (good | np.isnan(array) if missing else good).all():
+        index = np.argwhere(~good)[0].tolist()
+        bound = '' if most == math.inf else f' of at most {most:g}'
+        raise ValueError(f'{name}: {array[*index]} at {index}; expected finite numbers{bound}')
+    array.setflags(write=False)
+    return array
 
 
 def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
