@@ -307,11 +307,7 @@ def _run(id: str, look: Callable[[Environment], None]) -> None:
 
 
 def curve(id: str) -> np.ndarray:
-    """Plots the learning curves of all seeds, that of the shipped policy in front.
-
-    Raises:
-      ValueError: no policy is shipped.
-    """
+    """Plots the learning curves of all seeds, that of the shipped policy in front."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -350,10 +346,6 @@ def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST)
       path: file to write.
       source: digest to store in the file, see `Item`.
       largest: number of bytes that a .jpg should not exceed; the lowest quality may exceed it.
-
-    Raises:
-      ValueError: another suffix.
-      OSError: the file cannot be written.
     """
     from PIL import Image, PngImagePlugin
 

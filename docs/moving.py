@@ -71,9 +71,6 @@ def moving_picture(
 
     Returns:
       Pictures `STRIDE` * `FRAME` apart, each (height, width, 3) uint8.
-
-    Raises:
-      RuntimeError: no OpenGL library works.
     """
     id = suite.find(id).id
     environment = suite.make(id)
@@ -115,10 +112,6 @@ def save(images: Sequence[np.ndarray], path: Path, source: str = '') -> None:
       images: (h, w, 3) uint8 each.
       path: file to write; .webp.
       source: digest to store in the file.
-
-    Raises:
-      ValueError: no pictures, or another suffix.
-      OSError: the file cannot be written.
     """
     from PIL import Image
 

@@ -215,11 +215,7 @@ def _type(title: str, character: characters.CharacterSpec) -> TaskType:
 
 
 def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> None:
-    """Checks that task type and character are both planar or both three-dimensional.
-
-    Raises:
-      ValueError: they are not.
-    """
+    """Checks that task type and character are both planar or both three-dimensional."""
     if character.spatial != type_.spatial:
         raise ValueError(
             f'character {character.name!r} is {DIMENSIONS[character.spatial]}; the task '

@@ -69,11 +69,7 @@ class ActionMap:
         return (control - self.action_offset) / self.action_scale
 
     def checked(self, action: npt.ArrayLike, *num_envs: int) -> np.ndarray:
-        """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k).
-
-        Raises:
-          ValueError: another shape, or NaN or infinity; the message names simulation and joint.
-        """
+        """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k)."""
         shape = (*num_envs, len(self))
         are, have = ('actions are', 'actions have') if num_envs else ('action is', 'action has')
         try:

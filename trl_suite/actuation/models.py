@@ -283,11 +283,7 @@ ACTUATIONS = tuple(_MODELS)
 def character_muscles(
     character: Character, muscle_set: str = muscle_tables.PLAIN
 ) -> tuple[Muscle, ...]:
-    """Returns a character's muscles: one of the sets of `trl_suite.actuation.muscles.MUSCLES`.
-
-    Raises:
-      ValueError: the character has none, or no such set.
-    """
+    """Returns a character's muscles: one of the sets of `trl_suite.actuation.muscles.MUSCLES`."""
     name = character.spec.name
     sets = muscle_tables.MUSCLES.get(name)
     if sets is None:

@@ -128,11 +128,7 @@ class Units:
     """
 
     def __init__(self, character: Character, model: mujoco.MjModel) -> None:
-        """Finds the actuators.
-
-        Raises:
-          ValueError: the character has actuators of another kind than those of the suite.
-        """
+        """Finds the actuators."""
         scope, name = f'{character.mjcf_model.model}/', character.spec.name
         found = {model.actuator(i).name: i for i in range(model.nactuator)}
         tendons = int(mujoco.mjtTrn.mjTRN_TENDON)
@@ -283,11 +279,7 @@ class Strength:
 
 
 def check(actuators: Actuators, actuation: str) -> None:
-    """Checks that the options suit an actuation model, or 'gait'.
-
-    Raises:
-      ValueError: they do not; the message has the name of the option.
-    """
+    """Checks that the options suit an actuation model, or 'gait'."""
     for name, reason in NOT_FOR_MUSCLES.items():
         if actuation == 'muscle' and name in actuators.changed:
             raise ValueError(f'{name} is not an option of muscle control: {reason}')

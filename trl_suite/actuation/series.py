@@ -38,9 +38,6 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
       backlash: free play, rad; of a ball joint the largest angle of a cone's opening. 0 for none.
       flex: deflection of the springs at the torque limit, rad; 0 for no springs.
       damping: damping of the springs relative to their stiffness, s.
-
-    Raises:
-      ValueError: a body has several of the joints.
     """
     character = Character(spec)
     limits = dict(zip(spec.joints, character.torque_limits, strict=True))

@@ -104,9 +104,6 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
       own: name of the character's own curves; None if it has none.
       character: name of the character, for messages.
       joints: its joints.
-
-    Raises:
-      ValueError: the character has no curves, or the table is invalid.
     """
     if given is True:
         if own is None:

@@ -23,9 +23,6 @@ def prepare(spec: mujoco.MjSpec, file: pathlib.Path) -> None:
     Args:
       spec: the model, which is changed.
       file: its file, an absolute path.
-
-    Raises:
-      ValueError: a mesh cannot be read; the message names the mesh, its links, and the remedy.
     """
     bodies = users(spec)
     for mesh in spec.meshes:
@@ -63,11 +60,7 @@ def described(name: str, bodies: Iterable[str]) -> str:
 
 
 def _path(address: str, file: pathlib.Path) -> str:
-    """Returns the path of a mesh from its address in a file.
-
-    Raises:
-      ValueError: it is the address of something else than a local file.
-    """
+    """Returns the path of a mesh from its address in a file."""
     scheme, colon, rest = address.partition(':')
     if not colon or not re.fullmatch(r'[A-Za-z][\w+.-]+', scheme):  # one letter is a drive
         return address

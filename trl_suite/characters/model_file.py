@@ -88,12 +88,7 @@ def balance_inertia(spec: mujoco.MjSpec) -> None:
 
 
 def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles a file; a mesh without volume is no fault if the mass of its bodies is given.
-
-    Raises:
-      ValueError: the engine refuses it; the message is the engine's, or where there is a remedy, one
-        that names the link and the remedy.
-    """
+    """Compiles a file; a mesh without volume is no fault if the mass of its bodies is given."""
     # After an error, they cannot be asked for.
     users, shapes = meshes.users(spec), {mesh.name: mesh for mesh in spec.meshes}
     for _ in range(len(shapes) + 1):

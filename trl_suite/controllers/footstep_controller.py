@@ -49,9 +49,6 @@ class Controller:
 
         Functions other than policies can only be checked when they are called. If a policy was
         trained with another body, a warning is issued, since it may still work.
-
-        Raises:
-          ValueError: it has others; the message has both.
         """
         self._size = len(action_map)
         if self.policy is None:
@@ -66,12 +63,7 @@ class Controller:
             )
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Returns actions, (n, actions), for observations (n, size).
-
-        Raises:
-          ValueError: the controller returns anything but an array of numbers, the wrong shape, or
-            numbers that are not finite; the message then has the row.
-        """
+        """Returns actions, (n, actions), for observations (n, size)."""
         answer = self._function(observation)
         try:
             action = np.asarray(answer, dtype=float)
@@ -101,11 +93,6 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
     Args:
       source: a `Controller`, a `Policy`, the path of a policy, or any function from observations
         (n, size) to actions (n, k).
-
-    Raises:
-      TypeError: another type.
-      ValueError: a corrupt file; see `policies.load`.
-      FileNotFoundError: there is no such file.
     """
     if isinstance(source, Controller):
         return source

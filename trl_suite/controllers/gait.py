@@ -57,10 +57,6 @@ class Gait:
           ground_body: name of the body that has the ground geoms; 'world' if they have no body.
           root: MJCF element of the arena.
           gait: parameters; by default those for the character's name.
-
-        Raises:
-          ValueError: there is no gait for this character, or it lacks a joint or a foot of the
-            gait.
         """
         self.character = character
         self.parameters = gait = gait or parameters.load(character.spec.name)
@@ -168,11 +164,7 @@ class Gait:
         gaits.begin_all(self.world.all_ids[env_ids], self.parameters.action_offset, self._pack)
 
     def apply(self, env_ids: np.ndarray, vectors: np.ndarray) -> None:
-        """Begins cycles with parameters (m, P).
-
-        Raises:
-          ValueError: parameters of another shape.
-        """
+        """Begins cycles with parameters (m, P)."""
         env_ids, vectors = self.world.all_ids[env_ids], np.ascontiguousarray(vectors, float)
         expected = len(env_ids), len(self.parameters.names)
         if vectors.shape != expected:

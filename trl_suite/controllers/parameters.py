@@ -137,9 +137,6 @@ def load(character: str, base_actions: str = 'default') -> Parameters:
     Args:
       character: its name.
       base_actions: 'default', or 'original' for those of the papers.
-
-    Raises:
-      ValueError: the character has no gait, or `base_actions` is unknown.
     """
     errors.check_known('base_actions', BASE_ACTIONS, base_actions)
     errors.check_known('character with a gait', available(), character)
@@ -151,12 +148,7 @@ def load(character: str, base_actions: str = 'default') -> Parameters:
 
 
 def read(data: dict[str, Any]) -> Parameters:
-    """Makes parameters from the content of a file.
-
-    Raises:
-      ValueError: a vector has another length, a name is unknown, legs and feet do not fit, or no base
-        action changes a parameter of the actions.
-    """
+    """Makes parameters from the content of a file."""
     errors.check_known('kind of gait', KINDS, data['kind'])
     legs = tuple(tuple(leg) for leg in data['legs'])
     if len({len(leg) for leg in legs}) != 1 or len(legs) != len(data['feet']):

@@ -256,11 +256,7 @@ def names() -> list[str]:
 def shipped(
     path_or_name: str | os.PathLike[str], kind: str, known: list[str], suffix: str = ''
 ) -> pathlib.Path:
-    """Returns the path of a shipped file, or the argument if it is a PathLike or ends in .npz.
-
-    Raises:
-      ValueError: for a name that is not `known`; the message has the closest matches.
-    """
+    """Returns the path of a shipped file, or the argument if it is a PathLike or ends in .npz."""
     if not isinstance(path_or_name, str) or path_or_name.endswith('.npz'):
         return pathlib.Path(path_or_name)
     errors.check_known(kind, known, path_or_name)

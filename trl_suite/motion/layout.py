@@ -39,9 +39,6 @@ class Layout:
           root: 'planar' or 'free'.
           joints: joint names in the character's link order.
           sizes: columns of each in a pose, 1 (hinge) or 4 (ball).
-
-        Raises:
-          ValueError: if an argument is malformed; the message names it.
         """
         if root not in ROOT_SIZES:
             raise ValueError(f'root: {errors.unknown("root", root, ROOT_SIZES)}')
@@ -127,9 +124,6 @@ class Mirror:
           layout: layout of the poses and velocities.
           pairs: names of joints to swap, (right, left) in either order. Other joints keep their
             columns.
-
-        Raises:
-          ValueError: if a name is unknown or the joints of a pair differ in type.
         """
         self._pose_source, self._rate_source = np.arange(layout.columns), np.arange(layout.rates)
         self._pose_sign, self._rate_sign = np.ones(layout.columns), np.ones(layout.rates)

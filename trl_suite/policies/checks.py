@@ -16,11 +16,7 @@ array = functools.partial(errors.floats, dtype=np.float32)
 
 
 def stack(name: str, weight: Any, axes: int) -> tuple[int, ...]:
-    """Returns (m,) if the weights are those of m networks, with one axis more than `axes`, else ().
-
-    Raises:
-      ValueError: m is 0; the message has the name.
-    """
+    """Returns (m,) if the weights are those of m networks, with one axis more than `axes`, else ()."""
     found = np.shape(weight)[:1] if np.ndim(weight) == axes + 1 else ()
     if found == (0,):
         raise ValueError(f'{name}: expected the weights of at least one network')
@@ -35,9 +31,6 @@ def columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
       value: the indices.
       axes: number of axes of the array.
       inputs: number of columns.
-
-    Raises:
-      ValueError: not such indices; the message has the name.
     """
     copied = np.array(value)
     if copied.ndim != axes or copied.dtype.kind not in 'iu' or not copied.size:
@@ -49,11 +42,7 @@ def columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
 
 
 def largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) -> float:
-    """Returns a bound of a layer's sums, given a bound of its inputs.
-
-    Raises:
-      ValueError: larger than float32 can hold; the message has the name.
-    """
+    """Returns a bound of a layer's sums, given a bound of its inputs."""
     axes = tuple(range(weight.ndim - 1))
     most = float((np.abs(weight.astype(float)).sum(axes) * bound + np.abs(bias)).max())
     if most > LARGEST:

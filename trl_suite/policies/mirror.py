@@ -32,11 +32,7 @@ class Mirror:
     feet: tuple[int, int] | None = None
 
     def check(self, observations: int, actions: int) -> None:
-        """Checks that the fields fit these numbers of observations and actions.
-
-        Raises:
-          ValueError: they do not fit; the message names the field.
-        """
+        """Checks that the fields fit these numbers of observations and actions."""
         for kind, size in (('observation', observations), ('action', actions)):
             index, sign = getattr(self, f'{kind}_index'), getattr(self, f'{kind}_sign')
             if not np.array_equal(np.sort(index), np.arange(size)):

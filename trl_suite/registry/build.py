@@ -120,12 +120,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
 
 def _policy(name: str, source: Any) -> Any:
-    """Returns the policy shipped for an id or alias; other sources are returned unchanged.
-
-    Raises:
-      ValueError: an unknown id; the message has the option's name and the closest ids that have a
-        policy.
-    """
+    """Returns the policy shipped for an id or alias; other sources are returned unchanged."""
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
     if source not in BY_ID and source not in ALIASES:

@@ -59,12 +59,7 @@ def find(id: str) -> EnvSpec:
 
 
 def spec_of(environment: str | EnvSpec) -> EnvSpec:
-    """Returns the `EnvSpec` of an environment, from an id, an alias, or an `EnvSpec`.
-
-    Raises:
-      TypeError: the argument is none of these.
-      ValueError: unknown id; the message has the closest matches.
-    """
+    """Returns the `EnvSpec` of an environment, from an id, an alias, or an `EnvSpec`."""
     if isinstance(environment, (str, EnvSpec)):
         return find(environment) if isinstance(environment, str) else environment
     raise TypeError(f'an environment is an id, an alias or an EnvSpec, not {environment!r}')

@@ -60,9 +60,6 @@ def _make(kind: Any, max_width: int, max_height: int) -> Any:
     dm_control reads the variable when it is imported. If it is imported before this package, as
     with sorted imports, it chooses GLFW, even if there is no display. MuJoCo must not try that: its
     next attempt would end the process, whatever the library.
-
-    Raises:
-      RuntimeError: no OpenGL library works, or this process was forked from one that has rendered.
     """
     global _owner
     _check_process()

@@ -103,9 +103,6 @@ def check_options(
       model: the `mujoco.MjModel`; it may lack visual assets.
       task: its task.
       height, width, camera, ghost: as for `frame`.
-
-    Raises:
-      ValueError: as for `frame`.
     """
     from trl_suite.rendering import overlays
 
@@ -226,11 +223,7 @@ def _camera(model: Any, camera: str | int) -> int:
 
 
 def check_gl(physics: Any) -> None:
-    """Creates the rendering context for the first frame.
-
-    Raises:
-      RuntimeError: no OpenGL library works, or this process was forked from one that has rendered.
-    """
+    """Creates the rendering context for the first frame."""
     from trl_suite.rendering import contexts
 
     contexts.install()

@@ -44,9 +44,6 @@ class KinematicViewer:
 
         Args:
           character: a name in `trl_suite.characters.CHARACTERS`, or a user's own spec.
-
-        Raises:
-          ValueError: an unknown name; the message has the closest matches.
         """
         arena = composer.Arena()
         root = arena.mjcf_model
@@ -103,11 +100,7 @@ class KinematicViewer:
         return pose
 
     def put(self, pose: np.ndarray) -> None:
-        """Sets the pose, (columns,) as in `layout`.
-
-        Raises:
-          ValueError: a pose of another length.
-        """
+        """Sets the pose, (columns,) as in `layout`."""
         pose = np.asarray(pose, float)
         if pose.shape != (self.layout.columns,):
             raise ValueError(f'pose has shape {pose.shape}; expected ({self.layout.columns},)')

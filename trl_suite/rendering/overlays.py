@@ -23,21 +23,13 @@ GHOST_BEHIND = 0.7  # m; distance of the ghost behind the character, as seen by 
 
 
 def of_task(task: Any, with_ghost: bool = False) -> list[Overlay]:
-    """Returns the overlays of a task: its markers, and optionally the reference pose.
-
-    Raises:
-      ValueError: the task has no reference clip.
-    """
+    """Returns the overlays of a task: its markers, and optionally the reference pose."""
     drawn = [ghost(task)] if with_ghost else []
     return [*drawn, markers(task)] if has_markers(task) else drawn
 
 
 def ghost(task: Any) -> Overlay:
-    """Returns an overlay of the reference pose, translucent and behind the character.
-
-    Raises:
-      ValueError: the task has no reference clip.
-    """
+    """Returns an overlay of the reference pose, translucent and behind the character."""
     if not has_ghost(task):
         raise ValueError(f'the task {type(task).__name__} has no reference clip to show as a ghost')
 

@@ -204,9 +204,6 @@ def check_value(control: Any, value: Any) -> None:
     Args:
       control: handle of a dropdown, a group of buttons, a slider, a number, a checkbox or a button.
       value: the value, as a browser sent it.
-
-    Raises:
-      ValueError: the control cannot have it; the message has the label and what was expected.
     """
     name = control.label
     if hasattr(control, 'options'):

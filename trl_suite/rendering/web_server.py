@@ -15,11 +15,7 @@ PORTS, LAST_PORT = 1000, 65535  # number of ports tried; the largest port
 
 
 def load_viser() -> Any:
-    """Imports viser.
-
-    Raises:
-      ImportError: the extra 'viewer' is not installed.
-    """
+    """Imports viser."""
     return library('viser', 'trl_suite[viewer]')
 
 
@@ -36,12 +32,6 @@ def start_server(
       port: the first port to try; 0 for any free port.
       token: the path of its address, without which it answers nobody; None to answer nobody.
       report: called with a sentence about each refused value, in another thread.
-
-    Raises:
-      ImportError: the extra 'viewer' is not installed.
-      OSError: nothing can listen on this address.
-      RuntimeError: this version of viser cannot be guarded.
-      ValueError: no such port.
     """
     viser = load_viser()
     from trl_suite.rendering import web_guard  # imports viser, too
@@ -76,11 +66,7 @@ def _silent_viser() -> Iterator[None]:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Returns the first port that is free, at or after `port`; 0, any, if that is given.
-
-    Raises:
-      OSError: nothing can listen on this address.
-    """
+    """Returns the first port that is free, at or after `port`; 0, any, if that is given."""
     last = min(port + PORTS - 1, LAST_PORT)
     for number in range(port, last + 1):
         try:

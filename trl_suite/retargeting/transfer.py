@@ -70,9 +70,6 @@ def counterparts(
       motion: the motion.
       joints: joints of the character.
       joint_map: from the character's joints, and 'root', to the motion's; by default `guess_map`.
-
-    Raises:
-      ValueError: unknown joints, or no root in the map.
     """
     ours, theirs = ('root', *joints), _joints(motion)
     chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)

@@ -75,9 +75,6 @@ def check(result: Any, complete: bool = True) -> None:
     Args:
       result: content of a file.
       complete: whether the run must have ended.
-
-    Raises:
-      ValueError: a field is wrong; the message has its name and what was expected.
     """
     if not isinstance(result, dict):
         raise ValueError(f'a {type(result).__name__}; expected an object with {", ".join(FIELDS)}')

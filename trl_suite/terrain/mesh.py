@@ -173,10 +173,6 @@ def read_triangles(file: pathlib.Path) -> np.ndarray:
     """Returns the corners of a mesh file's triangles, (t, 3, 3), in its own units.
 
     Materials and textures are not read, nor any other file, except buffers of a .gltf in its folder.
-
-    Raises:
-      ValueError: the file is too large, or not a mesh.
-      ImportError: trimesh is not installed.
     """
     trimesh = library('trimesh', 'trimesh')
     content, kind = read_bytes(file), file.suffix.lower()[1:]
@@ -259,9 +255,6 @@ def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
     Args:
       triangles: corners, (t, 3, 3) m.
       x, y: ascending, (k,) and (m,) m.
-
-    Raises:
-      ValueError: triangles overlap so much that it would take minutes.
     """
     # Ray casting by trimesh would need another library, and take three times as long.
     heights = np.full((len(x), len(y)), -np.inf)

@@ -65,9 +65,6 @@ def check(
       where: the owner of the values, for the message.
       values: name -> number.
       parameters: the parameters, which have the values that are not given.
-
-    Raises:
-      ValueError: a value is not a finite number or is beyond its limits, or a Min is above its Max.
     """
     given = {}
     for key, value in values.items():

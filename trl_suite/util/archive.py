@@ -33,10 +33,6 @@ def read(
       fields: names of the fields. The value of a field that becomes a Python object is the allowed
         kinds of its dtype and its number of axes; None means an array, which the caller checks.
       defaults: values of fields that may be missing.
-
-    Raises:
-      ValueError: a corrupt file or a malformed field; the message has the path and the field.
-      FileNotFoundError: there is no file at the path.
     """
     found: dict[str, Any] = {}
     field = ''

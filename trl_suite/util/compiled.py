@@ -146,9 +146,6 @@ def packed(value: Any) -> Any:
 
     Compiled functions read its fields by name, as from the tuple. With `NUMBA_DISABLE_JIT=1` the
     tuple itself is returned. The pack keeps the arrays alive.
-
-    Raises:
-      TypeError: a field is not an array, a number, or a named tuple of these.
     """
     if _numba().config.DISABLE_JIT:
         return value
@@ -201,10 +198,6 @@ def _made(base: pathlib.Path) -> pathlib.Path:
     """Makes the folder below a base.
 
     Others may write to the base. They could only replace our folder by one that is not ours.
-
-    Raises:
-      OSError: a folder cannot be made, or it is a link, belongs to another user, or can be written
-        by others.
     """
     base.mkdir(0o700, parents=True, exist_ok=True)
     folder = base

@@ -93,9 +93,6 @@ def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
     Args:
       name: name of the argument that holds them.
       value: the options by name, or None.
-
-    Raises:
-      TypeError: the value is not a mapping.
     """
     if value is not None and not isinstance(value, Mapping):
         raise TypeError(f'{name} is {value!r}; expected a dict of options by name')

@@ -97,10 +97,6 @@ def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> N
       path: path of the file.
       largest: largest allowed size, bytes.
       size: size of the content, bytes, if it differs from that of the file.
-
-    Raises:
-      ValueError: it is not a regular file, or too large; the message names the file and both sizes.
-      OSError: there is no such file.
     """
     if size is None:
         size = pathlib.Path(path).stat().st_size
@@ -146,12 +142,7 @@ class Arrays(np.lib.npyio.NpzFile):
     """An open archive; an array is read, and checked, when it is taken out by its name."""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Returns an array.
-
-        Raises:
-          ValueError: the entry is not an array, or one that has more elements than bytes (of strings
-            without characters, or with an axis of length 0), whose lists would take all memory.
-        """
+        """Returns an array, unless it has more elements than bytes, whose lists would take all memory."""
         array = super().__getitem__(name)
         if not isinstance(array, np.ndarray):
             raise ValueError('is not an array')
@@ -161,12 +152,7 @@ class Arrays(np.lib.npyio.NpzFile):
 
 
 def load_arrays(path: Path) -> Arrays:
-    """Opens an archive of arrays (.npz) without pickled objects.
-
-    Raises:
-      ValueError: the file or its uncompressed content is too large, or it is not an archive.
-      OSError: it cannot be read.
-    """
+    """Opens an archive of arrays (.npz) without pickled objects."""
     content = io.BytesIO(read_bytes(path))
     try:
         with zipfile.ZipFile(content) as archive:
@@ -179,12 +165,7 @@ def load_arrays(path: Path) -> Arrays:
 
 
 def read_text(path: Path) -> str:
-    """Returns the text of a file.
-
-    Raises:
-      ValueError: it is too large or not UTF-8; the message names the file and the byte.
-      OSError: it cannot be read.
-    """
+    """Returns the text of a file."""
     content = io.BytesIO(read_bytes(path))
     try:
         return io.TextIOWrapper(content, encoding='utf-8-sig').read()
@@ -202,10 +183,6 @@ def read_json(
     Args:
       path: path of the file.
       object_pairs_hook: as for `json.loads`; a ValueError that it raises names the file.
-
-    Raises:
-      ValueError: it is not JSON, or nested too deeply; the message names the file.
-      OSError: it cannot be read.
     """
     text = read_text(path)
     try:
@@ -244,11 +221,7 @@ def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
 
 
 def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
-    """Replaces the lines between two marks in a page.
-
-    Raises:
-      ValueError: the page does not have both marks, in this order.
-    """
+    """Replaces the lines between two marks in a page."""
     before, found, rest = path.read_text(encoding='utf-8').partition(begin)
     _, ended, after = rest.partition(end)
     if not (found and ended):
@@ -296,11 +269,6 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
 
 
 def write_json(content: Any, path: pathlib.Path) -> None:
-    """Writes an indented .json file.
-
-    Raises:
-      ValueError: the content has a number that is not finite.
-      OSError: the file cannot be written.
-    """
+    """Writes an indented .json file."""
     with replacing(path) as part:
         part.write_text(f'{json.dumps(content, indent=1, allow_nan=False)}\n', encoding='utf-8')

@@ -22,9 +22,6 @@ def library(name: str, source: str) -> Any:
     Args:
       name: of the module, e.g. 'PIL.Image'.
       source: what to install with pip, e.g. 'trl_suite[video]' or `DM_CONTROL`.
-
-    Raises:
-      ImportError: it is not installed; the message tells how to install it.
     """
     try:
         return importlib.import_module(name)

@@ -186,12 +186,7 @@ def _digest(file: str) -> bytes:
 
 
 def _read(path: pathlib.Path) -> bytes:
-    """Returns the content of a file after its checksum.
-
-    Raises:
-      OSError: there is none, it is not a regular file, or others can have written it.
-      ValueError: it is damaged.
-    """
+    """Returns the content of a file after its checksum."""
     with open(os.open(path, os.O_RDONLY | _FLAGS), 'rb') as file:
         status = os.fstat(file.fileno())  # of the file that is read, whatever the path leads to now
         if not stat.S_ISREG(status.st_mode):

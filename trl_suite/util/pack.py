@@ -64,9 +64,6 @@ class Pack:
 
         Args:
           value: a named tuple whose fields are arrays, numbers, or such tuples.
-
-        Raises:
-          TypeError: a field has another type; the message has its name.
         """
         words: list[bytes] = []
         self.numba_type = _describe(value, type(value).__name__, words)

@@ -152,9 +152,6 @@ class Session:
         Args:
           direction: one of `PUSHES`. 'left' and 'right' have no effect on a planar character.
           speed: magnitude of the velocity, m/s.
-
-        Raises:
-          ValueError: if the direction is unknown.
         """
         errors.check_known('direction', PUSHES, direction)
         self._push = speed * np.array(PUSHES[direction])

@@ -98,10 +98,6 @@ def draw(
       parameters: a value for every parameter of the type, as from `Terrain.parameters`.
       length: nominal length, m; generators overshoot by up to one feature.
       rng: source of randomness.
-
-    Raises:
-      ValueError: unknown type, a length that is not positive or above LONGEST, or a generator that
-        returns anything but a finite `Profile` of at least one vertex.
     """
     check_known('terrain type', _generators, type_name)
     if not 0 < length <= LONGEST:

@@ -51,9 +51,6 @@ def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> 
       type_name: a key of GENERATORS3D.
       parameters: a value for every parameter of the type, as from `Terrain.parameters`.
       rng: source of randomness.
-
-    Raises:
-      ValueError: unknown type, or a generator that returns anything but a valid `Layout`.
     """
     check_known('three-dimensional terrain type', _generators, type_name)
     layout = _generators[type_name].function(parameters, rng)
