@@ -28,7 +28,7 @@ from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
-from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.tasks.variation import sensors, worlds
 from trl_suite.util import files, resources
 
 DOCS = pathlib.Path(__file__).resolve().parent

@@ -27,7 +27,7 @@ env = suite.make(args.id, task_kwargs={'random': args.seed, **mine})
 trained = suite.reference_policy(args.id)  # does not use the added block
 terms, time_step = [], env.reset()
 while not time_step.last() and len(terms) < 100:
-    seen = {name: time_step.observation[name] for name in env.task.task.blocks}
+    seen = {name: time_step.observation[name] for name in env.task.blocks}
     time_step = env.step(trained(seen))
     terms.append([*env.info['reward_terms'].values()])
 print(f'{len(terms)} steps, {env.info["distance"]:.1f} m; blocks {", ".join(env.blocks)}')

@@ -1,4 +1,4 @@
-"""Tests of trl_suite.tasks.disturbances: worlds that vary, pushes, sensors."""
+"""Tests of trl_suite.tasks.variation: worlds that vary, pushes, sensors."""
 
 import contextlib
 import copy
@@ -18,7 +18,7 @@ from helpers import FolderTest, advance, assert_goes_on, assert_rows_are_singles
 
 from trl_suite import suite
 from trl_suite.engine import PhysicsWorld, light_model, variation
-from trl_suite.tasks.disturbances import Disturbed, SensorConfig, WorldConfig, worlds
+from trl_suite.tasks.variation import SensorConfig, WorldConfig, worlds
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -218,7 +218,7 @@ class WorldTest(parameterized.TestCase):
         nominal = made(PLANAR)
         for _ in range(5):
             environment.reset()
-        variation_ = environment.task.variation
+        variation_ = environment.task.components[0].variation
         variation_.properties.mass[0], variation_.properties.com_offset[0] = 1.0, 0.0
         variation_.apply(0)
         found, expected = (each.physics.model.ptr for each in (environment, nominal))
@@ -262,8 +262,7 @@ class WorldTest(parameterized.TestCase):
 
     def test_a_task_that_draws_nothing_has_new_worlds_all_the_same(self):
         environment = made(PLANAR, randomize={'friction': (0, 1)})
-        inner = environment.task.task
-        inner.reset, found = lambda env_ids, random_states: None, set()
+        environment.task.reset, found = lambda env_ids, random_states: None, set()
         for _ in range(4):
             environment.reset()
             found.add(environment.info['world']['friction'])
@@ -280,7 +279,7 @@ class WorldTest(parameterized.TestCase):
 
     def test_nothing_asked_for_is_the_plain_task(self):
         for options in ({}, {'randomize': None, 'sensors': None}, {'randomize': {}, 'sensors': {}}):
-            self.assertNotIsInstance(made(PLANAR, **options).task, Disturbed)
+            self.assertEmpty(made(PLANAR, **options).task.components)
 
 
 class PushTest(parameterized.TestCase):
@@ -442,14 +441,14 @@ class SensorTest(parameterized.TestCase):
     def test_delays_of_presets_are_for_steps_of_a_thirtieth_of_a_second(self):
         for id_, depth in ((PLANAR, 3), (GAIT, 0), (PLAN, 0)):
             environment = made(id_, sensors='robot')
-            self.assertEqual(environment.task._sensor_state.history.shape[1], depth)
+            self.assertEqual(environment.task.components[-1].saved[0].history.shape[1], depth)
 
     def test_delay_of_an_episode_is_drawn(self):
         environments = VectorEnvironment(
             PLANAR, 256, 1, 0, task_kwargs={'sensors': {'delay': {'terrain': (1, 3)}}}
         )
         environments.reset()
-        delay = environments.task._sensor_state.delay[:, environments.blocks['terrain']]
+        delay = environments.task.components[-1].saved[0].delay[:, environments.blocks['terrain']]
         self.assertTrue((delay == delay[:, :1]).all())
         counts = np.bincount(delay[:, 0], minlength=4)
         self.assertEqual(counts[0], 0)

@@ -3,7 +3,7 @@
     suite.make(ID, task_kwargs={'actuators': {'torque_speed': True, 'delay': 20, 'strength': (0.8, 1.2)}})
 
 Every task whose joints are driven takes the option. `trl_suite.engine.motors` has the formulas, and
-`trl_suite.tasks.actuated` draws what changes between episodes.
+`trl_suite.tasks.variation.motors` draws what changes between episodes.
 
 Torques, gains and limits are those of the actuation model (see `trl_suite.actuation.models`). For a
 prismatic joint read m for rad and N for N m.

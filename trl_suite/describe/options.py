@@ -11,7 +11,7 @@ from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
 from trl_suite.kinematics.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.tasks.variation import sensors, worlds
 from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
 

@@ -112,14 +112,14 @@ class Core:
         at_limit = self.steps[ids] >= (np.inf if step_limit is None else step_limit)
         if time_limit < np.inf:
             at_limit = at_limit | (self.world.time[ids] >= time_limit - TIME_ERROR)
-        self.ended[ids] = at_limit | self.task.failed[ids]
+        self.ended[ids] = at_limit | self.task.seen.failed[ids]
         return at_limit
 
     def read(self, ids: list[int]) -> dict[str, Any]:
         """Returns a copy of the state of some simulations, without their random streams."""
         return {
             'world': [self.world.get_state(env_id) for env_id in ids],
-            'task': [self.task.get_state(env_id) for env_id in ids],
+            'task': [self.task.get_whole_state(env_id) for env_id in ids],
             'steps': self.steps[ids],
             'ended': self.ended[ids],
         }
@@ -127,7 +127,7 @@ class Core:
     def write(self, state: dict[str, Any], ids: list[int]) -> None:
         """Restores what `read` returned, in as many simulations."""
         for env_id, task, world in zip(ids, state['task'], state['world'], strict=True):
-            self.task.set_state(env_id, task)
+            self.task.set_whole_state(env_id, task)
             self.world.set_state(env_id, world)
         self.steps[ids], self.ended[ids] = state['steps'], state['ended']
 

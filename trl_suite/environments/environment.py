@@ -168,11 +168,11 @@ class Environment(composer.Environment):
             task.simulate(core.world.all_ids)
             self._hooks.after_step(physics, self._random_state)
         else:
-            task.step(action[None], core.world.all_ids)
+            task.advance(action[None], core.world.all_ids)
         self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
         if self._extra_observables:
             self._observation_updater.update()
-        reward, failed = float(task.reward[0]), bool(task.failed[0])
+        reward, failed = float(task.seen.reward[0]), bool(task.seen.failed[0])
         self._show_reward(reward)
         step_type = dm_env.StepType.LAST if core.ended[0] else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, reward, float(not failed), self._observe())

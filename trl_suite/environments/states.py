@@ -45,6 +45,8 @@ def signature(task: Task, kind: str) -> Signature:
     versions = f'{kind} of trl_suite {trl_suite.__version__} with MuJoCo {mujoco.__version__}'
     # The label names the class of CPU, on which a continuation is exact; on others it is valid, too.
     parts = {'environment': (f'{versions} on {machine.cpu_class()}', versions), **task.made_of}
+    for component in task.components:
+        parts |= component.made_of
     found = {name: (label, digest(part, _LABELS)) for name, (label, part) in parts.items()}
     model = task.world.models[0]
     fields = [getattr(of, name) for of in (model, model.opt) for name in _FIELDS[type(of)]]

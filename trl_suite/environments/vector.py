@@ -124,7 +124,7 @@ class VectorEnvironment:
         self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
         task = build_task(self.spec, options)
         model = light_model(task.root_entity.mjcf_model)
-        task.bind(BatchWorld(model, self.num_envs, int(num_threads), task.fields))
+        task.attach(BatchWorld(model, self.num_envs, int(num_threads), task.fields))
         streams = [np.random.RandomState(0)] * self.num_envs
         self.core = Core(task, 'vector environment', streams, threads=True)
         self.blocks, self.action_map = dict(task.blocks), task.action_map
@@ -168,7 +168,7 @@ class VectorEnvironment:
             if seed is not None:
                 self.seed(seed, ids)
             self.share(self.begin, ids)
-            return self._blocks(core.task.observation.astype(self.dtype))
+            return self._blocks(core.task.seen.observation.astype(self.dtype))
 
     def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
         """Takes one step in every simulation, or in some.
@@ -204,17 +204,17 @@ class VectorEnvironment:
         def work(part: np.ndarray) -> None:
             over = np.isin(part, resetting)
             self.begin(part[over])
-            task.step(action, part[~over])
+            task.advance(action, part[~over])
             # A slice is copied faster than an array of indices.
             near = len(part) and part[-1] - part[0] == len(part) - 1
             env_ids = slice(part[0], part[-1] + 1) if near else part
-            observation[env_ids] = task.observation[env_ids]
+            observation[env_ids] = task.seen.observation[env_ids]
 
-        observation = np.empty(task.observation.shape, self.dtype)
+        observation = np.empty(task.seen.observation.shape, self.dtype)
         self.share(work, asked)
         self.at_limit = np.zeros(self.num_envs, bool)
         self.at_limit[stepped] = core.count(stepped, self.step_limit, self.time_limit)
-        reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
+        reward, terminated, info = task.seen.reward.copy(), task.seen.failed.copy(), task.info()
         if len(stepped) < self.num_envs:
             resting = np.ones(self.num_envs, bool)
             resting[stepped] = False
@@ -224,11 +224,11 @@ class VectorEnvironment:
         if self.autoreset == 'same_step':
             info['ended'] = ended = core.ended.copy()
             if ended.any():
-                info['final_observation'] = self._blocks(task.observation.astype(self.dtype))
+                info['final_observation'] = self._blocks(task.seen.observation.astype(self.dtype))
                 self.share(self.begin, ended.nonzero()[0])
-                observation = task.observation.astype(self.dtype)
+                observation = task.seen.observation.astype(self.dtype)
         if len(asked) < self.num_envs:
-            observation = task.observation.astype(self.dtype)
+            observation = task.seen.observation.astype(self.dtype)
         reward = reward.astype(self.dtype, copy=False)
         return Step(self._blocks(observation), reward, terminated, truncated, info)
 
@@ -332,7 +332,7 @@ class VectorEnvironment:
         """Begins episodes in some simulations, without the checks and observations of `reset`."""
         core = self.core.usable()
         if len(env_ids):
-            core.task.reset(env_ids, [core.random[env_id] for env_id in env_ids.tolist()])
+            core.task.begin(env_ids, [core.random[env_id] for env_id in env_ids.tolist()])
             core.restart(env_ids)
 
     def _blocks(self, flat: np.ndarray) -> Any:

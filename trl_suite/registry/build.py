@@ -13,7 +13,7 @@ from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.registry.task_types import TASK_TYPES
-from trl_suite.tasks import actuated, composed, disturbances
+from trl_suite.tasks import variation
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
 from trl_suite.util import errors, notices
@@ -67,9 +67,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     Args:
       spec: spec of the environment.
       options: options of the task, which override those of the spec; in addition, every task has
-        the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`, and
-        `actuators`, `randomize` and `sensors`, see `trl_suite.actuation.Actuators` and
-        `trl_suite.tasks.disturbances`.
+        the options `rewards`, `observations`, `failures`, `actuators`, `randomize` and `sensors`, see
+        `trl_suite.tasks.variation`.
 
     Raises:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
@@ -77,14 +76,10 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     """
     notices.compiling.about(spec.id)
     merged = {**spec.options, **(options or {})}
-    extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
-    disturbing = {name: merged.pop(name) for name in disturbances.OPTIONS if name in merged}
-    actuators = Actuators.parse('actuators', merged.pop('actuators', {}))
+    varied = {name: merged.pop(name) for name in variation.OPTIONS if name in merged}
+    actuators = Actuators.parse('actuators', varied.get('actuators', {}))
     realism.check(actuators, spec.actuation)
-    type_, others = (
-        task_type(spec),
-        (*composed.OPTIONS, 'actuators', *disturbances.OPTIONS, 'random'),
-    )
+    type_, others = task_type(spec), (*variation.OPTIONS, 'random')
     config_type, config = config_of(spec), None
     if config_type is None:
         known = {option.name for option in task_options(spec)}
@@ -107,16 +102,16 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     parts = _parts(spec, type_, actuators)
     if type_ is not None:
         task = type_.make(parts, config)
-        task = actuated.actuate(task, actuators, parts.character)
-        return disturbances.disturb(composed.compose(task, extras), disturbing)
-    given: dict[str, Any] = merged if config is None else {'config': config}
-    if spec.clip is not None:
-        given['clip'] = parts.motion
-    task = spec.own['task_type'](
-        parts.character, parts.arena, actuation_model=parts.actuation, **given
-    )
-    task = actuated.actuate(task, actuators, parts.character)
-    return disturbances.disturb(composed.compose(task, extras), disturbing)
+    else:
+        given: dict[str, Any] = merged if config is None else {'config': config}
+        if spec.clip is not None:
+            given['clip'] = parts.motion
+        task = spec.own['task_type'](
+            parts.character, parts.arena, actuation_model=parts.actuation, **given
+        )
+    for component in variation.components(varied, actuators, parts.character):
+        task.add(component)
+    return task
 
 
 def _policy(name: str, source: Any) -> Any:

@@ -25,7 +25,7 @@ GHOST_BEHIND = 0.7  # m; distance of the ghost behind the character, as seen by 
 def of_task(task: Any, with_ghost: bool = False) -> list[Overlay]:
     """Returns the overlays of a task: its markers, and optionally the reference pose."""
     drawn = [ghost(task)] if with_ghost else []
-    return [*drawn, markers(task)] if has_markers(task) else drawn
+    return [*drawn, markers(task)]
 
 
 def ghost(task: Any) -> Overlay:
@@ -61,18 +61,14 @@ def has_ghost(task: Any) -> bool:
 
 
 def markers(task: Any) -> Overlay:
-    """Returns an overlay of the markers of a task: footstep plans, goals, paths."""
+    """Returns an overlay of the markers of a task: footstep plans, goals, paths, pushes."""
 
     def add(physics: Any, scene: Any) -> None:
-        for marker in task.markers(0):
-            append(scene, marker)
+        for part in (task, *task.components):
+            for marker in part.markers(0):
+                append(scene, marker)
 
     return add
-
-
-def has_markers(task: Any) -> bool:
-    """Whether a task has markers."""
-    return hasattr(task, 'markers')
 
 
 def observes_terrain(task: Any) -> bool:

@@ -1,7 +1,7 @@
 """Measurements of a task's character, for reward terms, observation blocks and failures.
 
 Each is a function of a task and returns an array with a leading axis of n simulations, as
-`trl_suite.tasks.composed` expects. The task must have a `figure`, planar or spatial, as all tasks
+`trl_suite.tasks.variation.additions` expects. The task must have a `figure`, planar or spatial, as all tasks
 of the suite do.
 """
 

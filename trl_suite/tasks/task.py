@@ -18,6 +18,7 @@ from dm_env import specs
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.kinematics.blocks import Block, layout
+from trl_suite.tasks.component import Component, position, seed_of
 from trl_suite.tasks.terms import Term
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
@@ -134,6 +135,8 @@ class Task(composer.Task):
       blocks: name -> slice of the observation, in order; a task may set it instead of `observed`.
       terms: the terms of the reward, in order.
       outcome: observation, reward and failure of each simulation.
+      components: what changes the task from outside, in this order.
+      seen: the outcome after all components, which an environment returns.
       saved: the state of the task: tuples of arrays (n, ...), of which `outcome` is one.
       info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays;
         updated in place.
@@ -143,11 +146,14 @@ class Task(composer.Task):
     action_map: ActionMap
     terms: tuple[Term, ...] = ()
     outcome: Outcome
+    components: tuple[Component, ...] = ()
+    seen: Outcome
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
     CONFIG: Any = None  # options: a subclass of `Config`, or a dict of them by `spec.spatial`
     fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
     in_parts = True  # whether several threads may call the task, each for some simulations
+    step_in_parts = True  # the same, without components
     _begun = False  # whether composer has reset the task, and no step has followed yet
 
     # Methods that a subclass implements.
@@ -204,12 +210,69 @@ class Task(composer.Task):
             'distance': distance,
         }
 
+    def add(self, component: Component) -> None:
+        """Adds a component; it must not be part of another task.
+
+        Raises:
+          ValueError: the component does not fit the task.
+        """
+        component.added_to(self)
+        self.components = *self.components, component
+
+    def attach(self, world: World) -> None:
+        """Binds the task and its components to a world."""
+        own, self.step_in_parts = self.__dict__.setdefault('_own', (self.observed, self.in_parts))
+        self.in_parts = self.step_in_parts
+        self.observed, self.blocks = own, layout(own)
+        for component in self.components:
+            component.prepare(world)
+        self.bind(world)
+        self.seen = self.outcome
+        for component in self.components:
+            self.seen = component.bind(world, self.seen)
+            self.in_parts &= component.in_parts
+            for name, entry in component.info_arrays.items():
+                terms = self.info_arrays.setdefault(name, entry)
+                if isinstance(entry, dict):
+                    terms |= entry
+        added = [block for component in self.components for block in component.blocks]
+        if added:
+            self.observed = *own, *added
+            self.blocks = layout(self.observed)
+
+    def begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        """Starts episodes, with components; see `reset`."""
+        if not self.components:
+            self.reset(env_ids, random_states)
+            return
+        before = [position(random_state) for random_state in random_states]
+        seeds = [seed_of(random_state) for random_state in random_states]
+        for component in self.components:
+            component.begin(env_ids, seeds)
+        self.reset(env_ids, random_states)
+        for random_state, old in zip(random_states, before, strict=True):
+            if position(random_state) == old:
+                random_state.random_sample()  # the task drew nothing: components vary all the same
+        for component in self.components:
+            component.finish(env_ids, True)
+
+    def advance(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        """Advances some simulations by one step, with components; see `step`."""
+        for component in self.components:
+            component.before_physics(action, env_ids)
+        if self.in_parts or not self.step_in_parts:
+            self.step(action, env_ids)
+        else:  # the components are called for all simulations together
+            self.world.share(lambda part: self.step(action, part), env_ids)
+        for component in self.components:
+            component.finish(env_ids, False)
+
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         """Advances some simulations by one step.
 
         Args:
           action: actions of all simulations, (n, k), in [-1, 1]; those of the others are ignored.
-          env_ids: sorted numbers of the simulations that take a step.
+          env_ids: sorted indices of the simulations that take a step.
         """
         self.apply_action(action, env_ids)
         self.simulate(env_ids)
@@ -229,24 +292,33 @@ class Task(composer.Task):
         return _each(self.info_arrays, np.copy)
 
     def info_of(self, env_id: int) -> dict[str, Any]:
-        """Returns `info` for one simulation, as numbers."""
-        return _each(self.info_arrays, lambda array: array.item(env_id))
+        """Returns `info` for one simulation, as numbers, or arrays if there are several."""
+        return _each(self.info_arrays, lambda array: _row(array, env_id))
 
     def get_state(self, env_id: int) -> dict[str, Any]:
-        """Returns the state of one simulation, except that of the world."""
-        arrays = [[array[env_id].copy() for array in group] for group in self.saved]
-        return {'arena': self.arena.state(env_id), 'arrays': arrays}  # type: ignore[attr-defined]
+        """Returns the state of one simulation, except that of the world and of components."""
+        return {'arena': self.arena.state(env_id), 'arrays': _state(self.saved, env_id)}  # type: ignore[attr-defined]
 
     def set_state(self, env_id: int, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the caller restores the world's state afterwards."""
         self.arena.restore(env_id, state['arena'])  # type: ignore[attr-defined]
-        for group, values in zip(self.saved, state['arrays'], strict=True):
-            for array, value in zip(group, values, strict=True):
-                array[env_id] = value
+        _restore(self.saved, env_id, state['arrays'])
+
+    def get_whole_state(self, env_id: int) -> dict[str, Any]:
+        """Returns the state of one simulation, with components, except that of the world."""
+        parts = [_state(component.saved, env_id) for component in self.components]
+        return {'task': self.get_state(env_id), 'components': parts}
+
+    def set_whole_state(self, env_id: int, state: dict[str, Any]) -> None:
+        """Restores a state from `get_whole_state`."""
+        for component, arrays in zip(self.components, state['components'], strict=True):
+            _restore(component.saved, env_id, arrays)
+            component.restored(env_id)
+        self.set_state(env_id, state['task'])
 
     @property
     def observation(self) -> np.ndarray:
-        """All observation blocks, concatenated, (n, observation size)."""
+        """Exact observation, without what components add or change, (n, size)."""
         return self.outcome.observation
 
     @property
@@ -292,10 +364,14 @@ class Task(composer.Task):
                 found[name] = getattr(value, 'name', ''), getattr(value, 'contents', value)
         return found
 
+    def markers(self, env_id: int) -> list[Marker]:
+        """Returns markers for rendered images of a simulation."""
+        return []
+
     # Composer's interface: one simulation.
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        self.bind(PhysicsWorld(physics, self.fields))
+        self.attach(PhysicsWorld(physics, self.fields))
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
         super().set_timesteps(control_timestep, physics_timestep)
@@ -304,7 +380,7 @@ class Task(composer.Task):
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        self.reset(self.world.all_ids, [random_state])
+        self.begin(self.world.all_ids, [random_state])
         self._begun = True
 
     def before_step(
@@ -314,19 +390,24 @@ class Task(composer.Task):
             # A plain composer.Environment leaves actuator velocities of zero after a reset.
             self.world.forward(self.world.all_ids)
             self._begun = False
-        self.apply_action(self.action_map.checked(action)[None], self.world.all_ids)
+        given = self.action_map.checked(action)[None]
+        for component in self.components:
+            component.before_physics(given, self.world.all_ids)
+        self.apply_action(given, self.world.all_ids)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self.finish_step(self.world.all_ids)
+        for component in self.components:
+            component.finish(self.world.all_ids, False)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
-        return float(self.reward[0])
+        return float(self.seen.reward[0])
 
     def get_discount(self, physics: mjcf.Physics) -> float:
-        return 0.0 if self.failed[0] else 1.0
+        return 0.0 if self.seen.failed[0] else 1.0
 
     def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
-        return bool(self.failed[0])
+        return bool(self.seen.failed[0])
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
         # One bound per number, as in dm_control's own action specs.
@@ -338,7 +419,7 @@ class Task(composer.Task):
     @property
     def task_observables(self) -> dict[str, observable.Observable]:
         def block(part: slice) -> observable.Generic:
-            item = observable.Generic(lambda physics: self.observation[0, part].copy())
+            item = observable.Generic(lambda physics: self.seen.observation[0, part].copy())
             item.enabled = True
             return item
 
@@ -354,6 +435,20 @@ def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dic
         name: _each(entry, function) if isinstance(entry, dict) else function(entry)
         for name, entry in entries.items()
     }
+
+
+def _row(array: np.ndarray, env_id: int) -> Any:
+    return array.item(env_id) if array.ndim == 1 else array[env_id].copy()
+
+
+def _state(saved: Sequence[NamedTuple], env_id: int) -> list[list[np.ndarray]]:
+    return [[array[env_id].copy() for array in group] for group in saved]
+
+
+def _restore(saved: Sequence[NamedTuple], env_id: int, state: list[list[np.ndarray]]) -> None:
+    for group, values in zip(saved, state, strict=True):
+        for array, value in zip(group, values, strict=True):
+            array[env_id] = value
 
 
 def check_simulated(lasted: np.ndarray) -> None:

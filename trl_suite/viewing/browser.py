@@ -315,7 +315,7 @@ class Browser:
     def _draw(self) -> None:
         task: Any = self.session.environment.task
         drawn, samples = [], None
-        if self.shown[PLAN] and overlays.has_markers(task):
+        if self.shown[PLAN]:
             drawn.append(overlays.markers(task))
         if self.shown[CLIP] and overlays.has_ghost(task):
             drawn.append(overlays.ghost(task))

@@ -181,7 +181,7 @@ class Session:
 
     def _rewards(self) -> np.ndarray:
         terms = self.environment.info.get('reward_terms', {})
-        rewards = [float(self.environment.task.reward[0]), *terms.values()]
+        rewards = [float(self.environment.task.seen.reward[0]), *terms.values()]
         return np.array(rewards[: len(self.reward_names)])
 
 

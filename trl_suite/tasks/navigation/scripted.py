@@ -14,7 +14,6 @@ import numpy as np
 from trl_suite.tasks.components.footstep_plan import SIDE
 from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.plan_actions import PLAN_NAMES
-from trl_suite.tasks.wrapper import unwrapped
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = (
@@ -49,7 +48,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     Raises:
       ValueError: the task is not a high-level one, or has the interface 'frame'.
     """
-    task = unwrapped(environments.task)
+    task = environments.task
     if not isinstance(task, HierarchicalNavigation):
         raise ValueError(
             f'the task {type(task).__name__} has no scripted policy; goal_navigation and soccer have one'

@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.engine import World
 from trl_suite.kinematics.blocks import LEVELS, Block, layout
+from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
+from trl_suite.tasks.task import Outcome, Task
 from trl_suite.util import errors
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import Config, Range, checked, option
 from trl_suite.util.random import random, standard_normal
 
@@ -276,3 +279,39 @@ def sense_all(env_ids: np.ndarray, kind: int, rules: SensorRules) -> None:
         if kind != AGAIN:
             draw(i, rules)
         observe(i, rules)
+
+
+class Sensors(Component):
+    """Sensors: the observation has noise, bias, drop-outs and delay.
+
+    Rewards, terminations and custom functions read the true state. `info` has 'clean_observation',
+    the exact observation, (n, size).
+    """
+
+    def __init__(self, config: SensorConfig) -> None:
+        self._config = config
+
+    def added_to(self, task: Task) -> None:
+        super().added_to(task)
+        self._observed = *task.observed, *(b for each in task.components for b in each.blocks)
+        check(self._config, self._observed)
+
+    @property
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {'sensors': (str(self._config.changed), self._config)}
+
+    def bind(self, world: World, outcome: Outcome) -> Outcome:
+        # Tasks whose steps last longer than 1/30 s have a callback within steps.
+        long_steps = hasattr(self.task, 'watch')
+        data = rules(self._config, self._observed, outcome.observation, long_steps)
+        self._pack, self._state = packed(data), data.state
+        self.saved = (data.state,)
+        self.info_arrays = {'clean_observation': outcome.observation}
+        return Outcome(data.state.observation, *outcome[1:])
+
+    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
+            seeded(env_id, spawned(seed, SENSORS), self._state.stream)
+
+    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
+        sense_all(env_ids, FRESH if fresh else NEXT, self._pack)

@@ -1,4 +1,4 @@
-"""Options of worlds that vary between episodes, and their random draws.
+"""Worlds that vary between episodes, and pushes: options, draws, and the component.
 
 Each property is drawn at the beginning of an episode, uniformly between two bounds, and stays
 constant until the next one; pushes are drawn one after the other.
@@ -8,14 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from trl_suite.engine.variation import Properties
+from trl_suite.engine import World
+from trl_suite.engine.pushes import DIRECTION, DURATION, FORCE, INTERVAL
+from trl_suite.engine.pushes import draw as draw_push
+from trl_suite.engine.variation import Properties, Variation
+from trl_suite.tasks.component import PUSH, WORLD, Component, seeded, spawned
+from trl_suite.tasks.task import Marker, Outcome, Task
+from trl_suite.util import errors
+from trl_suite.util.compiled import compiled_loop
 from trl_suite.util.options import Config, Range, option
 
+PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
+_METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
 # Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
 # robots are trained: friction 0.5 to 1.25 and changes of velocity of up to 1 m/s every 15 s in
 # legged_gym (`legged_robot_config.py`; Rudin et al. 2022, 'Learning to walk in minutes using
@@ -194,3 +203,127 @@ def direction(first: float, second: float, spatial: bool) -> np.ndarray:
     z = 2 * second - 1
     radius = np.sqrt(max(1 - z * z, 0.0))
     return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+class Worlds(Component):
+    """Properties of the world that vary between episodes, and pushes.
+
+    `info` has 'world', the drawn properties by name, and with pushes 'impulse', that of the last
+    step, (n, 3) N s.
+
+    Attributes:
+      variation: the properties, after `bind`.
+    """
+
+    variation: Variation
+
+    def __init__(self, config: WorldConfig) -> None:
+        self._config, self._push = config, config.push
+
+    def added_to(self, task: Task) -> None:
+        _check(task, self._config)
+        super().added_to(task)
+
+    @property
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {'randomize': (str(self._config.changed), self._config)}
+
+    def bind(self, world: World, outcome: Outcome) -> Outcome:
+        task: Any = self.task
+        figure, spatial = task.figure, task.character.spec.spatial
+        self._spatial = spatial
+        constants = getattr(task.root_entity, 'set_inertia', None)
+        dofs = figure.pose_dof[6 if spatial else 3 :]
+        self.variation = Variation(world, self._config.varied, figure.links, dofs, constants)
+        properties = self.variation.properties
+        self.saved = (properties,)
+        self.info_arrays = {
+            'world': {name: getattr(properties, name) for name in self._config.varied}
+        }
+        if self._push is not None:
+            pushes, push = world.engine.pushes, self._push
+            pushes.ranges[FORCE] = push.speed if push.force is None else push.force
+            pushes.ranges[DURATION], pushes.ranges[INTERVAL] = push.duration, push.interval
+            pushes.ranges[DIRECTION], pushes.planar[0] = push.direction, not spatial
+            pushes.mass[0] = self.variation.mass if push.force is None else 0.0
+            links = task.character.spec.links
+            pushes.body[0] = figure.links[0 if push.body is None else links.index(push.body)]
+            self.saved = properties, pushes.state
+            self.info_arrays['impulse'] = pushes.state.impulse
+            self._steps = np.zeros(world.n, int)
+        return outcome
+
+    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+        world = self.task.world
+        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
+            draw(
+                env_id, self._config, np.random.default_rng(spawned(seed, WORLD)), self._spatial,
+                self.variation.properties,
+            )  # fmt: skip
+            self.variation.apply(env_id)
+            if self._push is not None:
+                state = world.engine.pushes.state
+                seeded(env_id, spawned(seed, PUSH), state.stream)
+                state.impulse[env_id] = 0.0
+                first_push(np.array([env_id]), world.pack)
+
+    def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if self._push is not None:
+            engine = self.task.world.engine
+            engine.pushes.state.impulse[env_ids] = 0.0
+            self._steps[env_ids] = engine.steps[env_ids]
+
+    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if self._push is None or fresh:
+            return
+        if (self.task.world.engine.steps[env_ids] == self._steps[env_ids]).any():
+            raise RuntimeError(
+                'a plain composer.Environment has no pushes: use '
+                'trl_suite.environments.environment.Environment'
+            )
+
+    def restored(self, env_id: int) -> None:
+        self.variation.apply(env_id)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Returns an arrow for a push."""
+        if self._push is None:
+            return []
+        world = self.task.world
+        pushes, time = world.engine.pushes, world.time[env_id]
+        if not pushes.state.begin[env_id] <= time < pushes.state.end[env_id]:
+            return []
+        x, y, _ = pushes.state.force[env_id]
+        length = max(_METRES_PER_NEWTON * float(np.hypot(x, y)), 0.1)
+        yaw = float(np.arctan2(y, x))
+        place = world.xipos[env_id, pushes.body[0]].copy()
+        place[:2] -= (length + 0.15) * np.array([np.cos(yaw), np.sin(yaw)])
+        return [Marker('arrow', place, (0.03, 0.03, length), PUSH_COLOUR, yaw)]
+
+
+@compiled_loop
+def first_push(env_ids: np.ndarray, engine: Any) -> None:
+    """Draws the first push of episodes, which begin at time 0; takes the pack of a world."""
+    for i in env_ids:
+        draw_push(i, 0.0, engine.pushes)
+
+
+def _check(task: Task, world: WorldConfig) -> None:
+    """Checks that a task can have these worlds.
+
+    Raises:
+      ValueError: it cannot.
+    """
+    if not hasattr(task, 'figure') or not hasattr(task, 'character'):
+        raise ValueError(
+            f'randomize: the task {type(task).__name__} has no attributes `character` and `figure`, as '
+            'all tasks of the suite do'
+        )
+    spec = task.character.spec
+    if world.slope_direction is not None and not spec.spatial:
+        raise ValueError(
+            'slope_direction is for three-dimensional characters; planar ones move along x, so that '
+            'slope alone, positive or negative, is enough'
+        )
+    if world.push is not None and world.push.body not in (None, *spec.links):
+        raise ValueError(errors.unknown('link in push: body', world.push.body, spec.links))

@@ -1,0 +1,110 @@
+"""Imperfect motors: the option `actuators` of every task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite.actuation import realism, series
+from trl_suite.actuation.realism import Actuators
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.tasks.component import MOTORS, Component, spawned
+from trl_suite.util import random
+
+if TYPE_CHECKING:
+    from trl_suite.tasks.task import Outcome, Task
+
+
+class Motors(Component):
+    """The motors that `Actuators` describes drive the joints of a task.
+
+    `info` has 'delay' (ms) and 'strength_NAME' of each joint or muscle, if they are options.
+
+    Attributes:
+      actuators: the options.
+    """
+
+    def __init__(self, actuators: Actuators, character: Character) -> None:
+        """Keeps the options.
+
+        Args:
+          actuators: the options.
+          character: the character whose joints are driven, made from what `realism.body` returns; it
+            has its actuators.
+
+        Raises:
+          ValueError: an option that does not suit the character.
+        """
+        self.actuators, self._character = actuators, character
+        self._curves = realism.curves_of(actuators, character)
+
+    def added_to(self, task: Task) -> None:
+        super().added_to(task)
+        if self.actuators.backlash or self.actuators.flex:
+            series.finish(self._character, task.physics_timestep)
+
+    @property
+    def made_of(self) -> dict[str, tuple[str, Any]]:
+        return {'actuators': (str(self.actuators.changed), self.actuators)}
+
+    def prepare(self, world: World) -> None:
+        model, actuators = world.models[0], self.actuators
+        units = realism.Units(self._character, model)
+        self._timestep = world.engine.timestep
+        longest = self._steps(actuators.delay.high)
+        slots = longest // self.task.steps_per_call + 2 if longest else 0
+        self.motors = world.set_motors(
+            realism.limits(actuators, units, model, self._curves),
+            realism.noise(actuators, units, self._timestep),
+            len(units.names),
+            slots,
+        )
+        self.saved = (self.motors,)
+        self._streams = random.Streams(0)
+        self._streams.state = self.motors.stream
+        self._strength = realism.Strength(actuators, units, world)
+        self._delay, self._age = np.zeros(world.n), np.zeros(world.n)
+        self._info: dict[str, np.ndarray] = {}
+        if 'strength' in actuators.changed:
+            for name, strength in zip(units.names, self.motors.strength.T, strict=True):
+                self._info[f'strength_{name}'] = strength
+        if longest:
+            self._info['delay'] = self._delay
+
+    def bind(self, world: World, outcome: Outcome) -> Outcome:
+        self.info_arrays = self._info
+        for env_id in world.all_ids.tolist():
+            self._strength.apply(env_id, self.motors.strength[env_id])
+        return outcome
+
+    def _steps(self, delay: float) -> int:
+        """Returns a delay in ms as physics steps."""
+        return round(delay / 1000 / self._timestep)
+
+    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
+            own = spawned(seed, MOTORS)
+            state, rng = self.motors, np.random.default_rng(own)
+            state.age[env_id] = state.given[env_id] = state.used[env_id] = 0
+            state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
+            state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
+            state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
+            self._streams.seed(env_id, own.spawn(1)[0])
+            self.restored(env_id)
+
+    def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        self._age[env_ids] = self.motors.age[env_ids]
+
+    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if not fresh and (self.motors.age[env_ids] == self._age[env_ids]).any():
+            raise RuntimeError(
+                'the motors of this task are updated before every physics step: use '
+                'trl_suite.environments.environment.Environment, not a plain composer.Environment'
+            )
+
+    def restored(self, env_id: int) -> None:
+        self._delay[env_id] = 1000 * self._timestep * self.motors.lag[env_id]
+        self._strength.apply(env_id, self.motors.strength[env_id])
