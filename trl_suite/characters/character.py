@@ -138,6 +138,8 @@ class Character(composer.Entity):
             self._mjcf_root = mjcf.from_path(str(resources.directory('xml') / f'{spec.name}.xml'))
         if name is not None:
             self._mjcf_root.model = name
+        # Names that the file lacks raise here.
+        _ = *self.bodies, *self.joints, *self.end_effectors
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:
