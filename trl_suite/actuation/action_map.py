@@ -54,10 +54,8 @@ class ActionMap:
     def drive(self, first: int) -> Drive:
         """Returns the map for compiled functions; `first` is the address of the first control."""
         vectors, none = np.zeros((0, 3), int), np.zeros(0, int)
-        return Drive(
-            self.action_offset, self.action_scale, first, vectors, np.zeros(0), none, vectors,
-            np.zeros((2, 0), int),
-        )  # fmt: skip
+        offset, scale, hinges = self.action_offset, self.action_scale, np.zeros((2, 0), int)
+        return Drive(offset, scale, first, vectors, np.zeros(0), none, vectors, hinges)
 
     @functools.cached_property
     def _rows(self) -> tuple[np.ndarray, ...]:

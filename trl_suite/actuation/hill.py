@@ -10,6 +10,8 @@ and signs and sizes of constant arms are those of the table in `muscles.py`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from trl_suite.actuation.muscles import Arm, Muscle
@@ -21,10 +23,7 @@ MIN_ACTIVATION = 0.01
 # force by length; 0.18 by velocity, at a slow stretch, where the original is steeper; of passive
 # force 0.10 up to a length of 1.6, and 0.5 at 1.8.
 MUJOCO_RANGE = (0.5, 1.5)  # of operating lengths; only determines the scale of `lengthrange`
-MUJOCO_LMIN, MUJOCO_LMAX = 0.30, 1.70
-MUJOCO_VMAX = 6.0
-MUJOCO_FPMAX = 0.86
-MUJOCO_FVMAX = 1.5
+MUJOCO_CURVES = (0.30, 1.70, 6.0, 0.86, 1.5)  # lmin, lmax, vmax, fpmax, fvmax
 
 
 def constant_arm(arm: Arm) -> float:
@@ -44,16 +43,18 @@ def rest_length(muscle: Muscle) -> float:
     return -sum(constant_arm(arm) * arm.rest for arm in muscle.arms)
 
 
-def mujoco_parameters(muscle: Muscle) -> dict[str, tuple[float, ...]]:
+def mujoco_parameters(muscle: Muscle) -> dict[str, Any]:
     """Attributes of the MuJoCo `general` actuator that represents a muscle."""
     scale = optimal_length(muscle)
     tendon = rest_length(muscle) - scale
-    parameters = (
-        *MUJOCO_RANGE, muscle.f_max, 200.0, MUJOCO_LMIN, MUJOCO_LMAX, MUJOCO_VMAX, MUJOCO_FPMAX,
-        MUJOCO_FVMAX,
-    )  # fmt: skip
+    parameters = (*MUJOCO_RANGE, muscle.f_max, 200.0, *MUJOCO_CURVES)
     return {
+        'dyntype': 'none',
+        'gaintype': 'muscle',
+        'biastype': 'muscle',
         'gainprm': parameters,
         'biasprm': parameters,
+        'ctrllimited': True,
+        'ctrlrange': (MIN_ACTIVATION, 1),
         'lengthrange': tuple(tendon + end * scale for end in MUJOCO_RANGE),
     }

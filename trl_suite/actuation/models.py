@@ -152,16 +152,14 @@ def _add_velocity(character: Character, timestep: float, **_: object) -> ActionM
     for (name, joint, options), limit, gain, damping in zip(
         _dofs(character), *figures, strict=True
     ):
-        character.mjcf_model.actuator.add(
-            'general', name=name, joint=joint, gaintype='fixed', biastype='affine',
-            gainprm=(gain,), biasprm=(0, 0, -damping), ctrllimited=False,
-            forcelimited=True, forcerange=(-limit, limit), **options,
-        )  # fmt: skip
+        options |= {'gaintype': 'fixed', 'gainprm': (gain,)}
+        options |= {'biastype': 'affine', 'biasprm': (0, 0, -damping), 'ctrllimited': False}
+        options |= {'forcelimited': True, 'forcerange': (-limit, limit)}
+        character.mjcf_model.actuator.add('general', name=name, joint=joint, **options)
     names = _split(character, 'xyz')
-    return ActionMap(
-        names, 'target velocity', _unit(character, 'rad/s', 'm/s'), np.zeros(len(names)),
-        _by_type(character, VELOCITY_SCALE, SLIDE_VELOCITY_SCALE), names,
-    )  # fmt: skip
+    unit, offset = _unit(character, 'rad/s', 'm/s'), np.zeros(len(names))
+    scale = _by_type(character, VELOCITY_SCALE, SLIDE_VELOCITY_SCALE)
+    return ActionMap(names, 'target velocity', unit, offset, scale, names)
 
 
 def _add_position(
@@ -178,22 +176,17 @@ def _add_position(
     kd = np.array([joint.kd for joint in joints])
     passive = np.minimum(limits / DAMPING_DIVISOR, kd)
     _prepare(character, timestep, passive)
-    for name, joint, element, limit, servo, ball in zip(
-        character.spec.joints, joints, character.joints, limits, kd - passive, character.spherical,
-        strict=True,
-    ):  # fmt: skip
+    add, elements, balls = character.mjcf_model.actuator.add, character.joints, character.spherical
+    for (name, joint), element, limit, servo, ball in zip(
+        character.spec.joints.items(), elements, limits, kd - passive, balls, strict=True
+    ):
+        common = {'name': name, 'joint': element, 'kp': joint.kp, 'kv': servo, 'forcelimited': True}
         if ball:
             # Its control is a rotation vector, its force range bounds a norm. At the clamp, the
             # last bit of the norm decides whether MuJoCo 3.17 keeps the implicit damping of a step.
-            character.mjcf_model.actuator.add(
-                'orientation', name=name, joint=element, kp=joint.kp, kv=servo,
-                forcelimited=True, forcerange=(0, limit),
-            )  # fmt: skip
+            add('orientation', forcerange=(0, limit), **common)
         else:
-            character.mjcf_model.actuator.add(
-                'position', name=name, joint=element, kp=joint.kp, kv=servo, ctrllimited=False,
-                forcelimited=True, forcerange=(-limit, limit),
-            )  # fmt: skip
+            add('position', ctrllimited=False, forcerange=(-limit, limit), **common)
     if rotations == 'angle_axis':
         if action_offset is not None or action_scale is not None:
             raise ValueError(
@@ -203,10 +196,10 @@ def _add_position(
         return _angle_axis(character)
     names = _split(character, 'xyz')
     if action_offset is None:
-        middle = np.concatenate([
-            np.broadcast_to(joint.target, size)
-            for joint, size in zip(joints, character.dofs, strict=True)
-        ]).astype(float)  # fmt: skip
+        targets = [
+            np.broadcast_to(j.target, n) for j, n in zip(joints, character.dofs, strict=True)
+        ]
+        middle = np.concatenate(targets).astype(float)
     else:
         middle = errors.floats('action_offset', action_offset).copy()
     if action_scale is None:
@@ -260,15 +253,11 @@ def _add_muscle(
             # In MuJoCo the moment is d length / d angle, and a muscle's force is negative.
             tendon.add('joint', joint=joints[arm.joint], coef=-hill.constant_arm(arm))
         character.mjcf_model.actuator.add(
-            'general', name=unit.name, tendon=tendon, ctrllimited=True,
-            ctrlrange=(hill.MIN_ACTIVATION, 1), dyntype='none', gaintype='muscle',
-            biastype='muscle', **hill.mujoco_parameters(unit),
-        )  # fmt: skip
-    return ActionMap(
-        tuple(unit.name for unit in units), 'excitation', '1',
-        np.full(len(units), EXCITATION_OFFSET), np.full(len(units), EXCITATION_SCALE),
-        tuple(unit.name for unit in units),
-    )  # fmt: skip
+            'general', name=unit.name, tendon=tendon, **hill.mujoco_parameters(unit)
+        )
+    names, count = tuple(unit.name for unit in units), len(units)
+    offset, scale = np.full(count, EXCITATION_OFFSET), np.full(count, EXCITATION_SCALE)
+    return ActionMap(names, 'excitation', '1', offset, scale, names)
 
 
 _MODELS: dict[str, Callable[..., ActionMap]] = {

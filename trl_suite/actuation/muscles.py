@@ -207,8 +207,10 @@ def _legs(right: tuple[Muscle, ...]) -> tuple[Muscle, ...]:
 
 
 _BIPED_SETS = {
-    PLAIN: _legs(_BIPED_LEG), 'walk': _legs(_BIPED_WALK_LEG), 'run': _legs(_BIPED_RUN_LEG),
-}  # fmt: skip
+    PLAIN: _legs(_BIPED_LEG),
+    'walk': _legs(_BIPED_WALK_LEG),
+    'run': _legs(_BIPED_RUN_LEG),
+}
 # For each character PLAIN, then the sets by the motion for which they were optimised. The 12-link
 # biped has the same leg muscles (its arms are passive); the goat has those of the dog, whose
 # skeleton it shares.

@@ -14,7 +14,6 @@ of the joint without any torque inside. Both begin an episode at 0.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from xml.etree import ElementTree
 
 import numpy as np
@@ -86,9 +85,9 @@ def _divide(
 ) -> None:
     """Moves everything but the joint to inner bodies, with joints of their own."""
     name = joint.get('name', '')
-    link = ElementTree.Element('body', {
-        key: value for key, value in body.attrib.items() if key not in _FRAME
-    })  # fmt: skip
+    link = ElementTree.Element(
+        'body', {key: value for key, value in body.attrib.items() if key not in _FRAME}
+    )
     for child in [*body]:
         if child is not joint:
             body.remove(child)
@@ -103,19 +102,15 @@ def _divide(
         ball = joint.get('type') == 'ball'
         low, high = (0.0, backlash / 2) if ball else (-backlash / 2, backlash / 2)
         gear = ElementTree.SubElement(body, 'body', name=f'{name}_gear') if flex else link
-        _joint(
-            gear, joint, PLAY, limited='true', range=f'{low!r} {high!r}',
-            armature=repr(GEAR_INERTIA) if flex else '0',
-        )  # fmt: skip
+        armature = repr(GEAR_INERTIA) if flex else '0'
+        _joint(gear, joint, PLAY, limited='true', range=f'{low!r} {high!r}', armature=armature)
         if flex:
             _inertia(gear)
             inner = gear
     if flex:
         stiffness = limit / flex
-        _joint(
-            link, joint, FLEX, limited='false', armature='0',
-            stiffness=repr(float(stiffness)), damping=repr(float(stiffness * damping)),
-        )  # fmt: skip
+        passive = {'stiffness': repr(float(stiffness)), 'damping': repr(float(stiffness * damping))}
+        _joint(link, joint, FLEX, limited='false', armature='0', **passive)
     inner.append(link)
 
 
@@ -129,15 +124,12 @@ def _joint(
     body: ElementTree.Element, like: ElementTree.Element, suffix: str, **attributes: str
 ) -> None:
     """Adds a joint with the axis of another one, before the other elements of a body."""
-    joint = ElementTree.Element('joint', {
-        key: like.attrib[key] for key in _KEPT if key in like.attrib
-    })  # fmt: skip
+    joint = ElementTree.Element(
+        'joint', {key: like.attrib[key] for key in _KEPT if key in like.attrib}
+    )
     joint.set('name', like.get('name', '') + suffix)
-    passive: Mapping[str, str] = {
-        'damping': '0', 'stiffness': '0', 'frictionloss': '0', 'springref': '0',
-        'actuatorfrclimited': 'false',
-    }  # fmt: skip
-    for key, value in {**passive, **attributes}.items():
+    passive = dict.fromkeys(('damping', 'stiffness', 'frictionloss', 'springref'), '0')
+    for key, value in {**passive, 'actuatorfrclimited': 'false', **attributes}.items():
         joint.set(key, value)
     body.insert(0, joint)
 

@@ -30,12 +30,8 @@ FACING = 0.7  # cosine of the largest angle between +x and the facing direction 
 LATERAL = 1e-3  # rad; largest deviation of a planar character's joint axis from plane or normal
 
 _FREE, _BALL, _SLIDE, _HINGE = (
-    int(kind)
-    for kind in (
-        mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE,
-        mujoco.mjtJoint.mjJNT_HINGE,
-    )
-)  # fmt: skip
+    int(getattr(mujoco.mjtJoint, f'mjJNT_{kind}')) for kind in ('FREE', 'BALL', 'SLIDE', 'HINGE')
+)
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SIDES = (
     ('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'), ('l$', 'r'), ('L$', 'R'),
@@ -236,9 +232,8 @@ class ModelInspector:
         """The parameters of all joints; sets `limits`, their largest torques or forces."""
         model, figures = self.model, {}
         self.limits: dict[str, float] = {}
-        assumed: dict[str, list[str]] = {
-            'limit': [], 'gains': [], 'damping': [], 'posture': [], 'free': [],
-        }  # fmt: skip
+        kinds = 'limit', 'gains', 'damping', 'posture', 'free'
+        assumed: dict[str, list[str]] = {kind: [] for kind in kinds}
         for i in self.joints.tolist():
             name, kind = model.joint(i).name, int(model.jnt_type[i])
             kp, kv, limit = self._actuators(i)

@@ -201,8 +201,9 @@ def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjMod
     body = spec.body(root)
     for equality in spec.equalities:
         if equality.objtype == mujoco.mjtObj.mjOBJ_BODY and root in (
-            equality.name1, equality.name2,
-        ):  # fmt: skip
+            equality.name1,
+            equality.name2,
+        ):
             raise ValueError(
                 f'the root {root!r} is rotated, and equality {equality.name!r} refers to it; remove '
                 'the equality, or rotate the character in the file'

@@ -42,8 +42,9 @@ def run(arguments: argparse.Namespace) -> None:
     for spec in (bar := tqdm.tqdm(specs, unit='environment', disable=None)):
         bar.set_description(spec.id)
         made: tuple[Environment | VectorEnvironment, ...] = (
-            suite.build_environment(spec, {'random': 0}, {}), VectorEnvironment(spec, 2, 1, seed=0)
-        )  # fmt: skip
+            suite.build_environment(spec, {'random': 0}, {}),
+            VectorEnvironment(spec, 2, 1, seed=0),
+        )
         for environment, shape in zip(made, ((), (2,)), strict=True):
             environment.reset()
             environment.step(np.zeros((*shape, len(environment.action_map))))

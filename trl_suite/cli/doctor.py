@@ -147,9 +147,10 @@ def extras() -> Iterator[Finding]:
         missing = [name for name in modules if importlib.util.find_spec(name) is None]
         if missing:
             yield Finding(
-                NOTE, f"extra '{extra}': {', '.join(missing)} not installed",
+                NOTE,
+                f"extra '{extra}': {', '.join(missing)} not installed",
                 f"to use it: pip install 'trl_suite[{extra}]'",
-            )  # fmt: skip
+            )
         else:
             yield Finding(OK, f"extra '{extra}'")
 
@@ -182,9 +183,10 @@ def compiled_code() -> Finding:
         folder = compiled.cache_folder()
     if folder is None:
         return Finding(
-            NOTE, 'no folder for compiled code can be used: every process compiles again',
+            NOTE,
+            'no folder for compiled code can be used: every process compiles again',
             'set NUMBA_CACHE_DIR to a folder of your own',
-        )  # fmt: skip
+        )
     sizes = [path.stat().st_size for path in folder.rglob('*') if path.is_file()]
     text = f'compiled code in {folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB'
     return Finding(OK, text)
@@ -212,9 +214,10 @@ def self_test(works: Sequence[str]) -> Iterator[Finding]:
         _, out, other = _end(_start(_RUN, 'disable'))
         if not out:
             yield Finding(
-                FAILED, f'no environment runs: {other}',
+                FAILED,
+                f'no environment runs: {other}',
                 'see the failures above; if there are none: pip install --force-reinstall trl_suite',
-            )  # fmt: skip
+            )
             return
     yield Finding(OK, f'an environment runs: {", ".join(json.loads(out.splitlines()[-1]))}')
     if status:

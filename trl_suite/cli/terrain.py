@@ -45,10 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
     if output.suffix.lower() in terrain.WRITTEN:
         _write_mesh(arguments, output)
         return
-    rendering.plot_terrain(
-        arguments.terrain, output, arguments.draws, arguments.length, arguments.seed,
-        arguments.terrain_level,
-    )  # fmt: skip
+    drawn = arguments.draws, arguments.length, arguments.seed, arguments.terrain_level
+    rendering.plot_terrain(arguments.terrain, output, *drawn)
     print(output)
 
 

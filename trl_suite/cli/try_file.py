@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
 TERRAINS = {True: ('plane', 'hills3d', 'stairs3d'), False: ('flat', 'slopes', 'steps')}
 SECONDS = 1.0  # duration of zero actions before a picture is rendered
-_ARGUMENTS = re.compile(
-    r'\b(root|spatial|turn|end_effectors|fall_links|balance_inertia)=(True|False)?'
-)
+OPTIONS = ('root', 'spatial', 'turn', 'end_effectors', 'fall_links', 'balance_inertia')
+_ARGUMENTS = re.compile(rf'\b({"|".join(OPTIONS)})=(True|False)?')
 
 
 def declare(commands: Any) -> None:
@@ -62,13 +61,10 @@ def run(arguments: argparse.Namespace) -> None:
     from trl_suite import characters
 
     name = arguments.file.stem
+    options = {option: getattr(arguments, option) for option in OPTIONS}
+    options['name'] = f'{name}_file' if name in characters.CHARACTERS else name
     try:
-        spec = characters.from_file(
-            arguments.file, end_effectors=arguments.end_effectors, fall_links=arguments.fall_links,
-            root=arguments.root, spatial=arguments.spatial, turn=arguments.turn,
-            balance_inertia=arguments.balance_inertia,
-            name=f'{name}_file' if name in characters.CHARACTERS else name,
-        )  # fmt: skip
+        spec = characters.from_file(arguments.file, **options)
     except ValueError as error:
         raise ValueError(_options(str(error))) from None
     pictures: list[np.ndarray] = []

@@ -75,10 +75,8 @@ class Gait:
         self._soles = gait.feet if gait.kind == 'bound' else ()
         for foot in self._soles:
             box = next(geom for geom in character.collision_geoms if geom.parent is bodies[foot])
-            bodies[foot].add(
-                'site', name=f'{foot}_sole', size=(0.01,), group=4, quat=box.quat,
-                pos=np.array(box.pos) - (0, 0, box.size[2]),
-            )  # fmt: skip
+            place = {'pos': np.array(box.pos) - (0, 0, box.size[2]), 'quat': box.quat}
+            bodies[foot].add('site', name=f'{foot}_sole', size=(0.01,), group=4, **place)
 
     def bind(self, world: World) -> None:
         """Resolves names in a compiled world, which must have bound `dynamics.FIELDS`."""
@@ -111,13 +109,16 @@ class Gait:
         )
         n, size, count = world.n, len(skeleton.dof), len(self.number)
         self.state = GaitState(
-            np.tile(gait.action_offset, (n, 1)), np.zeros(n, int), np.zeros(n), np.zeros((n, count)),
-            np.zeros(n, int), np.zeros(n, bool), np.zeros(n, bool),
-        )  # fmt: skip
-        scratch = Scratch(
-            np.zeros((n, count)), np.zeros((n, size, size)), np.zeros((n, size)),
-            np.zeros((n, 4, size)),
-        )  # fmt: skip
+            vector=np.tile(gait.action_offset, (n, 1)),
+            number=np.zeros(n, int),
+            phase=np.zeros(n),
+            target=np.zeros((n, count)),
+            stance=np.zeros(n, int),
+            rising=np.zeros(n, bool),
+            airborne=np.zeros(n, bool),
+        )
+        shapes = (count,), (size, size), (size,), (4, size)
+        scratch = Scratch(*(np.zeros((n, *shape)) for shape in shapes))
         physics = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
         mechanics = Mechanics(*(getattr(world, name) for name in Mechanics._fields))
         self.rules = GaitRules(skeleton, physics, mechanics, machine, self.state, scratch)
@@ -154,10 +155,11 @@ class Gait:
             return *3 * (timed,), f'{foot}: end of the cycle, stance and swing leg are exchanged'
         leg = feet[0]
         return (
-            f'{leg} touches the ground: end of the cycle', 'root starts to rise',
+            f'{leg} touches the ground: end of the cycle',
+            'root starts to rise',
             f'{leg} leaves the ground',
             f'root starts to fall; if {leg} touches the ground first, the next state is UpStance',
-        )  # fmt: skip
+        )
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Resets state machines to the start of their first cycle, with the default parameters."""

@@ -114,13 +114,18 @@ _FIELDS = {
     'info': ('U', 0),
 }  # fmt: skip
 _MIRROR = {
-    'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
-    'action_index': ('iu', 1), 'action_sign': ('f', 1),
-}  # fmt: skip
+    'observation_index': ('iu', 1),
+    'observation_sign': ('f', 1),
+    'action_index': ('iu', 1),
+    'action_sign': ('f', 1),
+}
 _SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
 _OPTIONAL = {
-    'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2), 'largest_change': ('f', 0),
-}  # fmt: skip
+    'places': ('iu', 2),
+    'columns': ('iu', 1),
+    'choices': ('f', 2),
+    'largest_change': ('f', 0),
+}
 _LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
 _LINE_OPTIONAL = {'origin': ('iu', 0), 'grid': ('iu', 1)}
 

@@ -13,9 +13,11 @@ from trl_suite.registry.spec import EnvSpec
 
 PREFIX = {'position': 'PD', 'torque': 'Torque', 'muscle': 'MTU', 'velocity': 'Vel'}
 BY = {
-    'position': 'PD targets', 'torque': 'joint torques', 'muscle': 'muscle excitations',
+    'position': 'PD targets',
+    'torque': 'joint torques',
+    'muscle': 'muscle excitations',
     'velocity': 'joint velocity targets',
-}  # fmt: skip
+}
 
 # Phases in the air. In stance the clip brakes: its hips turn at 12 rad/s, and at the corresponding
 # shortening velocity the raptor's hip extensors produce a third of the force that braking requires,

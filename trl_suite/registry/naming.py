@@ -3,15 +3,23 @@
 # Names of characters in the original's ids, and words for the gaits in descriptions.
 NAMES = {'biped2d': 'Biped2D', 'biped2d_full': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D'}
 GAITS = {
-    'biped2d_walk': 'walk', 'biped2d_run': 'run', 'biped2d_full_walk': 'walk', 'dog_bound': 'bound',
-    'raptor_run_050': 'run', 'raptor_run_066': 'run',
-}  # fmt: skip
+    'biped2d_walk': 'walk',
+    'biped2d_run': 'run',
+    'biped2d_full_walk': 'walk',
+    'dog_bound': 'bound',
+    'raptor_run_050': 'run',
+    'raptor_run_066': 'run',
+}
 
 NOT_REGISTERED = {
-    'PD_Dog2D_Flat_Terrain-v0', 'PD_Raptor2D_Flat_Terrain-v0', 'PD_Biped2D_Mixed_Terrain-v0',
-    'PD_Dog2D_Mixed_Terrain-v0', 'PD_Raptor2D_Mixed_Terrain-v0', 'PD_Dog2D_Flat-v0',
+    'PD_Dog2D_Flat_Terrain-v0',
+    'PD_Raptor2D_Flat_Terrain-v0',
+    'PD_Biped2D_Mixed_Terrain-v0',
+    'PD_Dog2D_Mixed_Terrain-v0',
+    'PD_Raptor2D_Mixed_Terrain-v0',
+    'PD_Dog2D_Flat-v0',
     'PD_Raptor2D_Flat-v0',
-}  # fmt: skip
+}
 
 
 def status(id_: str, original: bool) -> str:

@@ -11,9 +11,7 @@ from trl_suite.registry.naming import GAITS, NAMES, status
 from trl_suite.registry.spec import EnvSpec
 
 SAMPLES = 50  # observed terrain heights, except in blind environments
-CHARACTERS = {
-    'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound', 'raptor': 'raptor_run_050',
-}  # fmt: skip
+CHARACTERS = {'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound', 'raptor': 'raptor_run_050'}
 # Name in ids, preset, words.
 TERRAINS = (
     ('Flat', 'flat', 'flat ground'),
@@ -24,7 +22,7 @@ TERRAINS = (
     ('Walls', 'walls_humanoid', 'walls 5 to 25 cm high'),
     ('Mixed', 'mixed_humanoid', 'a mix of gaps, walls and steps'),
     ('Slopes_Mixed', 'slopes_mixed_humanoid', 'gaps, walls and steps on rolling slopes'),
-)  # fmt: skip
+)
 
 
 def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> EnvSpec:

@@ -22,9 +22,12 @@ _GAIT_TERRAINS = (
     ('Steps', 'steps', 'steps up and down'),
 )
 _NAMES = {  # in ids
-    'biped2d_simbicon': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D', 'hopper': 'Hopper2D',
+    'biped2d_simbicon': 'Biped2D',
+    'dog': 'Dog2D',
+    'raptor': 'Raptor2D',
+    'hopper': 'Hopper2D',
     'goat': 'Goat2D',
-}  # fmt: skip
+}
 _ON_ALL_TERRAINS = ('biped2d_simbicon', 'dog', 'raptor', 'hopper')
 _MORE_GAITS = (
     ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),

@@ -41,4 +41,4 @@ __all__ = [
     'spread',
     'video',
     'watching',
-]  # fmt: skip
+]

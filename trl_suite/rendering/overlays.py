@@ -40,10 +40,8 @@ def ghost(task: Any) -> Overlay:
         data.qpos[addresses] = task.reference_pose(0)
         mujoco.mj_kinematics(model, data)
         before = scene.ngeom
-        mujoco.mjv_addGeoms(
-            model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC,
-            scene,
-        )  # fmt: skip
+        options = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC
+        mujoco.mjv_addGeoms(model, data, *options, scene)
         root = model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == addresses[0])[0]]
         for geom in scene.geoms[before : scene.ngeom]:
             # Moving boxes have no ghosts.
@@ -109,10 +107,13 @@ def append(scene: Any, marker: Marker) -> None:
     else:
         axes = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     mujoco.mjv_initGeom(
-        geom, getattr(mujoco.mjtGeom, f'mjGEOM_{marker.shape.upper()}'),
-        np.array(marker.size, float), np.array(marker.position, float), axes.ravel(),
+        geom,
+        getattr(mujoco.mjtGeom, f'mjGEOM_{marker.shape.upper()}'),
+        np.array(marker.size, float),
+        np.array(marker.position, float),
+        axes.ravel(),
         np.array(marker.colour, np.float32),
-    )  # fmt: skip
+    )
     # Attributes that mjv_initGeom does not initialise.
     geom.category, geom.objtype = mujoco.mjtCatBit.mjCAT_DECOR, mujoco.mjtObj.mjOBJ_UNKNOWN
     geom.objid = geom.dataid = geom.matid = geom.segid = -1

@@ -177,10 +177,11 @@ def _plot_maps(
             cmap='viridis', interpolation='nearest',
         )  # fmt: skip
         panel.annotate(
-            '', xytext=(x, y),
+            '',
+            xytext=(x, y),
             xy=(x + 0.06 * length * np.cos(heading), y + 0.06 * length * np.sin(heading)),
             arrowprops={'arrowstyle': '->', 'color': 'tab:red', 'linewidth': 1.5},
-        )  # fmt: skip
+        )
         panel.set_xlabel('x (m)')
         panel.tick_params(labelleft=panel is panels[0])
     panels[0].set_ylabel('y (m)')

@@ -94,18 +94,20 @@ class Video:
 
     def _start(self, height: int, width: int) -> None:
         """Starts ffmpeg, whose exit status tells whether all was written; imageio ignores it."""
-        command = [
-            self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
-            '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
-            'yuv420p', '-crf', '15', f'file:{self._part}',  # a name with a colon is no address
-        ]  # fmt: skip
+        source = f'-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self._fps} -i -'
+        options = f'-y -loglevel error {source} -c:v libx264 -pix_fmt yuv420p -crf 15'.split()
+        # After file: a name with a colon is no address.
+        command = [self._library.get_ffmpeg_exe(), *options, f'file:{self._part}']
         # An interrupt between the start and the return would leave an encoder that nobody ends, and
         # that creates the file after it was removed.
         with interrupts.postponed():
             self._encoder = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
                 start_new_session=True,  # an interrupt from the keyboard is for this process alone
-            )  # fmt: skip
+            )
 
     def _failure(self, encoder: subprocess.Popen[bytes]) -> OSError:
         """Returns why the encoder ended, which it must have done."""

@@ -33,10 +33,12 @@ LONGEST = 255  # characters of a file name, or of a value in a report
 ACCEPTED = {
     kind.__name__: kind
     for kind in (
-        _messages.ViewerCameraMessage, _messages.GuiUpdateMessage,
-        _messages.FileTransferStartUpload, _messages.FileTransferPart,
+        _messages.ViewerCameraMessage,
+        _messages.GuiUpdateMessage,
+        _messages.FileTransferStartUpload,
+        _messages.FileTransferPart,
     )
-}  # fmt: skip
+}
 _LOGGER = logging.getLogger(__name__)
 # Of bytes that are no request. Errors of the server's own code are still logged.
 _LOGGER.addFilter(lambda record: record.getMessage() != 'opening handshake failed')
@@ -78,9 +80,11 @@ class Guard:
                 answer = options['process_request']
                 options |= {
                     'process_request': lambda *request: self._admit(answer, *request),
-                    'max_size': LARGEST_MESSAGE, 'logger': _LOGGER, 'select_subprotocol': None,
+                    'max_size': LARGEST_MESSAGE,
+                    'logger': _LOGGER,
+                    'select_subprotocol': None,
                     'subprotocols': [f'viser-v{viser.__version__}'],
-                }  # fmt: skip
+                }
                 return serve(self._checking(handler), *arguments, **options)
 
             module.serve = guarded  # type: ignore[assignment, misc]

@@ -135,9 +135,11 @@ def height_field_mesh(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
     bottom, right = rows - 1 - top, columns - 1 - left
     if top or left:  # no cracks: along the border fine cells are as straight as coarse ones
         for line in (
-            heights[top, left : right + 1], heights[bottom, left : right + 1],
-            heights[top : bottom + 1, left], heights[top : bottom + 1, right],
-        ):  # fmt: skip
+            heights[top, left : right + 1],
+            heights[bottom, left : right + 1],
+            heights[top : bottom + 1, left],
+            heights[top : bottom + 1, right],
+        ):
             line[1:-1:2] = 0.5 * (line[:-2:2] + line[2::2])
     across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
     local = np.stack([across.ravel(), along.ravel(), heights.ravel()], axis=1)

@@ -96,10 +96,8 @@ class WebScene:
           jump: whether the view moves to the character at once, as at the start of an episode.
         """
         data = self._physics.data.ptr
-        mujoco.mjv_updateScene(
-            self._model, data, self.option, self._perturbation, self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL, self._scene,
-        )  # fmt: skip
+        options = self.option, self._perturbation, self._camera, mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, data, *options, self._scene)
         for overlay in overlays:
             overlay(self._physics, self._scene)
         root = np.array(data.xpos[self._root])
@@ -135,9 +133,11 @@ class WebScene:
                 np.array(part, float) for part in zip(*batch, strict=True)
             )
             values = {
-                'batched_positions': positions + offset, 'batched_wxyzs': _quaternions(axes),
-                'batched_scales': sizes, 'batched_colors': to_bytes(colours[:, :3] ** GAMMA),
-            }  # fmt: skip
+                'batched_positions': positions + offset,
+                'batched_wxyzs': _quaternions(axes),
+                'batched_scales': sizes,
+                'batched_colors': to_bytes(colours[:, :3] ** GAMMA),
+            }
             if name.endswith('_clear'):
                 values['batched_opacities'] = colours[:, 3]
             if name in self._handles:
@@ -159,9 +159,12 @@ class WebScene:
         is_wide = self._profile is None and (model.geom_size[boxes] > REACH).any()
         middle = STRIDE * np.round(self._focus / STRIDE)  # of the squares
         sources = [
-            data.geom_xpos[ground], data.geom_xmat[ground], model.geom_size[ground],
-            model.hfield_data, middle[:2] * is_wide,
-        ]  # fmt: skip
+            data.geom_xpos[ground],
+            data.geom_xmat[ground],
+            model.geom_size[ground],
+            model.hfield_data,
+            middle[:2] * is_wide,
+        ]
         if not self._laid or not all(map(np.array_equal, sources, self._laid)):
             self._laid = [source.copy() for source in sources]
             self._lay_ground(middle, NEAR_REACH if is_wide else REACH)
@@ -189,9 +192,11 @@ class WebScene:
         for key, part in parts.items():
             if key in self._ground_handles:
                 _assign(
-                    self._ground_handles[key], vertices=part.vertices, faces=part.faces,
+                    self._ground_handles[key],
+                    vertices=part.vertices,
+                    faces=part.faces,
                     visible=True,
-                )  # fmt: skip
+                )
                 continue
             material, kind, number = key
             colour = SHADES[number] * self._colours[material][:3]

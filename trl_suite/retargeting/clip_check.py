@@ -97,10 +97,8 @@ class Report:
         rows = []
         for (kind, name), found in sorted(groups.items()):
             worst = max(found, key=lambda fault: fault.amount)
-            rows.append(
-                (kind, name, len(found), found[0].frame, found[-1].frame,
-                 f'{worst.amount:.3g}', worst.unit, worst.frame)
-            )  # fmt: skip
+            frames = len(found), found[0].frame, found[-1].frame
+            rows.append((kind, name, *frames, f'{worst.amount:.3g}', worst.unit, worst.frame))
         header = ('fault', 'where', 'frames', 'first', 'last', 'worst', '', 'in frame')
         return f'{title}\n{tables.table(header, rows)}'
 

@@ -13,9 +13,11 @@ from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util.files import Path, existing, read_json
 
 FORMATS = {
-    'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepTerrainRL, DeepMimic)',
+    'bvh': 'BVH (begins with HIERARCHY)',
+    'amc': 'Acclaim (.amc)',
+    'json': 'JSON (TerrainRL, DeepTerrainRL, DeepMimic)',
     'npz': 'a clip (.npz)',
-}  # fmt: skip
+}
 HEAD = 65536  # bytes at the beginning of a file from which its format is recognised
 
 

@@ -38,7 +38,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     '{side}_elbow': ('{side}_elbow', '{s}radius', '{side}forearm', '{side}elbow'),
     '{side}_forearm': ('{side}_elbow', '{s}radius', '{side}forearm', '{side}elbow'),
     '{side}_wrist': ('{side}_wrist', '{s}hand', '{side}hand', '{side}wrist'),
-}  # fmt: skip
+}
 
 
 def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
@@ -140,11 +140,9 @@ def retarget(
     poses = _poses(figure, motion, chosen, size * path, quaternion.multiply(upright, turns), links)
     height = 1 if layout.root == 'planar' else 2
     poses[:, height] -= np.quantile(_lowest(figure, poses), SINKING)
-    return Clip(
-        motion.name, motion.times, poses, layout.root, layout.joints,
-        layout.sizes, getattr(motion, 'loop', False),
-        f'{motion.name}, retargeted to {figure.character.spec.name}',
-    )  # fmt: skip
+    kind, loop = (layout.root, layout.joints, layout.sizes), getattr(motion, 'loop', False)
+    description = f'{motion.name}, retargeted to {figure.character.spec.name}'
+    return Clip(motion.name, motion.times, poses, *kind, loop, description)
 
 
 def _root(motion: Clip) -> tuple[np.ndarray, np.ndarray]:

@@ -24,9 +24,7 @@ MEMORY = 2 * 10**9  # bytes in addition to those of imported libraries, on Linux
 WAIT = 60.0  # s of real time, e.g. for a pipe that nobody writes
 MESSAGE = 1000  # characters of a message, which may quote the file
 _READY = b'.'  # precedes the result: the child could import the function
-_ENVIRONMENT = {
-    'MUJOCO_GL': 'disable', 'OPENBLAS_NUM_THREADS': '1', 'MALLOC_ARENA_MAX': '2',
-}  # fmt: skip
+_ENVIRONMENT = {'MUJOCO_GL': 'disable', 'OPENBLAS_NUM_THREADS': '1', 'MALLOC_ARENA_MAX': '2'}
 
 
 def call(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -49,9 +47,12 @@ def call(function: Callable[..., Any], *arguments: Any) -> Any:
     )
     try:
         run = subprocess.run(  # -P, lest a module is imported from the working folder
-            [sys.executable, '-P', '-c', code], input=pickle.dumps((function, arguments)),
-            capture_output=True, env={**os.environ, **_ENVIRONMENT}, timeout=WAIT,
-        )  # fmt: skip
+            [sys.executable, '-P', '-c', code],
+            input=pickle.dumps((function, arguments)),
+            capture_output=True,
+            env={**os.environ, **_ENVIRONMENT},
+            timeout=WAIT,
+        )
     except subprocess.TimeoutExpired:
         raise ValueError(_beyond(f'no end within {WAIT:g} s')) from None
     if not run.stdout.startswith(_READY):

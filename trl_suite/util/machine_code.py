@@ -56,11 +56,9 @@ class Cache(NullCache):
         """
         code, config = function.__code__, cast(Any, numba.config)
         self._folder = folder
-        self._key = (
-            numba.__version__, config.OPT, config.BOUNDSCHECK, sys.version, entry,
-            code.co_filename, _digest(code.co_filename), function.__qualname__,
-            [*code.co_positions()],
-        )  # fmt: skip
+        compiler = numba.__version__, config.OPT, config.BOUNDSCHECK, sys.version, entry
+        place = code.co_filename, _digest(code.co_filename), function.__qualname__
+        self._key = (*compiler, *place, [*code.co_positions()])
 
     def attach(self, dispatcher: Any) -> None:
         """Makes a dispatcher use this cache."""

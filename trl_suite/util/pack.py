@@ -81,9 +81,8 @@ def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
             kind = entry.dtype, entry.ndim, entry.flags.num
             found = _array_types.get(kind) or _array_types.setdefault(kind, typeof(entry))
             # No owner and no reference count: the pack keeps the array alive.
-            numbers = (
-                0, 0, entry.size, entry.itemsize, entry.ctypes.data, *entry.shape, *entry.strides,
-            )  # fmt: skip
+            sizes = entry.size, entry.itemsize, entry.ctypes.data
+            numbers = (0, 0, *sizes, *entry.shape, *entry.strides)
             words += [struct.pack('=q', number) for number in numbers]
         elif isinstance(entry, bool | int | np.bool_ | np.integer):
             found = types.int64

@@ -139,18 +139,14 @@ def uniform(i: int, low: float, high: float, state: np.ndarray) -> float:
 class _Bits(ctypes.Structure):
     """NumPy's bitgen_t."""
 
-    _fields_ = [
-        ('state', ctypes.c_void_p), ('next_uint64', ctypes.c_void_p),
-        ('next_uint32', ctypes.c_void_p), ('next_double', ctypes.c_void_p),
-        ('next_raw', ctypes.c_void_p),
-    ]  # fmt: skip
+    _names = ('state', 'next_uint64', 'next_uint32', 'next_double', 'next_raw')
+    _fields_ = [(name, ctypes.c_void_p) for name in _names]
 
 
 _DRAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
-_capsule_address = ctypes.pythonapi.PyCapsule_GetPointer
-_capsule_address.restype, _capsule_address.argtypes = ctypes.c_void_p, (
-    ctypes.py_object, ctypes.c_char_p,
-)  # fmt: skip
+_capsule_address = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ('PyCapsule_GetPointer', ctypes.pythonapi)
+)
 
 
 def address(generator: np.random.Generator) -> int:

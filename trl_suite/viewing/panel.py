@@ -153,9 +153,12 @@ class Panel:
     def _add_plot(self, title: str) -> Any:
         uplot = load_viser().uplot
         return self._server.gui.add_uplot(
-            (np.zeros(1), np.zeros(1)), (uplot.Series(), uplot.Series()), title=title,
-            height=PLOT_HEIGHT, scales={'x': uplot.Scale(time=False)},
-        )  # fmt: skip
+            (np.zeros(1), np.zeros(1)),
+            (uplot.Series(), uplot.Series()),
+            title=title,
+            height=PLOT_HEIGHT,
+            scales={'x': uplot.Scale(time=False)},
+        )
 
     def _name(self, plot: Any, names: tuple[str, ...]) -> None:
         """Changes the lines of a plot. A new plot would receive the data sent to the old one."""

@@ -80,9 +80,10 @@ class Session:
         model = environment.physics.model
         root_dofs, self._root_dof = _root_dofs(environment)
         joints = [
-            i for i in range(model.nv)
+            i
+            for i in range(model.nv)
             if i not in root_dofs and model.dof_treeid[i] == model.dof_treeid[self._root_dof]
-        ]  # fmt: skip
+        ]
         self._joint_dofs = np.array(joints, int)
         self.joint_axes = tuple(_axis_name(model, dof) for dof in joints)
         terms = environment.info.get('reward_terms', {})
@@ -169,9 +170,11 @@ class Session:
         """Returns the texts of the status display, by name."""
         info = self.environment.info
         texts = {
-            'episode': str(self.episode), 'step': str(self.steps),
-            'time': f'{self.environment.physics.data.time:.1f} s', 'return': f'{self.total:.2f}',
-        }  # fmt: skip
+            'episode': str(self.episode),
+            'step': str(self.steps),
+            'time': f'{self.environment.physics.data.time:.1f} s',
+            'return': f'{self.total:.2f}',
+        }
         if 'distance' in info:
             texts['distance'] = f'{info["distance"]:.2f} m'
         if self.time_step.last():

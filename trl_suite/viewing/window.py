@@ -29,9 +29,11 @@ class Window(application.Application):
         self._field = np.zeros(0)  # as uploaded to the graphics card
         self._pause_subject.toggle()
         self._viewer = viewer.Viewer(
-            self._viewport, self._window.mouse, self._window.keyboard,
+            self._viewport,
+            self._window.mouse,
+            self._window.keyboard,
             scene_callback=self._before_drawing,
-        )  # fmt: skip
+        )
 
     def _perform_deferred_reload(self, params: Any) -> None:
         super()._perform_deferred_reload(params)
