@@ -127,7 +127,7 @@ call = Compiled(_call, _call_native)
 
 
 @compiled
-def write(i: int, engine: Engine) -> None:
+def arrays_to_physics(i: int, engine: Engine) -> None:
     """Copies the fields that tasks may write from the arrays to the physics."""
     for k in range(min(engine.written, len(engine.sizes))):
         size = engine.sizes[k]
@@ -135,7 +135,7 @@ def write(i: int, engine: Engine) -> None:
 
 
 @compiled
-def read(i: int, engine: Engine) -> None:
+def physics_to_arrays(i: int, engine: Engine) -> None:
     """Copies all fields from the physics to the arrays."""
     for k in range(len(engine.sizes)):
         size = engine.sizes[k]
@@ -150,7 +150,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     others, then `mj_step1`, so that positions and velocities of bodies belong to the new state.
     """
     model, data = engine.models[i], engine.data[i]
-    write(i, engine)
+    arrays_to_physics(i, engine)
     pushed = pushes.advance(i, engine.time[i], nstep * engine.timestep, engine.pushes)
     if pushed:
         begin_push(i, engine.pushes)
@@ -166,7 +166,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     engine.steps[i] += nstep
     if pushed:
         end_push(i, engine.pushes)
-    read(i, engine)
+    physics_to_arrays(i, engine)
 
 
 @compiled
@@ -206,9 +206,9 @@ def step_motors(i: int, nstep: int, engine: Engine) -> None:
 @compiled
 def forward(i: int, engine: Engine) -> None:
     """Recomputes all quantities that depend on the state, after the state was written."""
-    write(i, engine)
+    arrays_to_physics(i, engine)
     call(engine.functions[FORWARD], engine.models[i], engine.data[i])
-    read(i, engine)
+    physics_to_arrays(i, engine)
 
 
 @compiled
@@ -216,7 +216,7 @@ def reset(i: int, engine: Engine) -> None:
     """Resets a simulation to the model's initial state and clears its warnings."""
     call(engine.functions[RESET], engine.models[i], engine.data[i])
     engine.time[i] = 0.0
-    read(i, engine)
+    physics_to_arrays(i, engine)
 
 
 @compiled
@@ -259,13 +259,6 @@ def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Resets simulations to the model's initial state."""
     for i in env_ids:
         reset(i, engine)
-
-
-@compiled_loop
-def read_all(env_ids: np.ndarray, engine: Engine) -> None:
-    """Copies all fields of some simulations from the physics to the arrays."""
-    for i in env_ids:
-        read(i, engine)
 
 
 @compiled_loop
