@@ -139,7 +139,7 @@ class Character(composer.Entity):
         if name is not None:
             self._mjcf_root.model = name
         # Names that the file lacks raise here.
-        _ = *self.bodies, *self.joints, *self.end_effectors
+        _ = *self.joints, *self.bodies, *self.end_effectors
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:

@@ -49,34 +49,22 @@ def run(arguments: argparse.Namespace) -> None:
         spec, baseline or acting.trained(arguments.policy, spec.id), arguments.episodes, arguments.seed,
         arguments.threads, options, factory=baseline is not None, progress=True,
     )  # fmt: skip
+    result['policy'] = arguments.policy
     if arguments.json is not None:
         given = {'options': dict(arguments.options)} if arguments.options else {}
-        files.write_json({**result, 'policy': arguments.policy, **given}, arguments.json)
-    interval, distances = result['return_interval'], result['distance_interval']
-    lines = (
-        ('policy', arguments.policy),
-        ('episodes', f'{result["episodes"]}, seed {result["seed"]}'),
-        (
-            'return',
-            f'{result["return"]:.2f}'
-            + ('' if interval is None else f' +- {interval:.2f} (95 % confidence)')
-            + f', {result["normalized_return"]:.1%} of the maximum {result["step_limit"]}',
-        ),
-        ('length', f'{result["length"]:.1f} of {result["step_limit"]} steps'),
-        (
-            'distance',
-            f'{result["distance"]:.2f} m'
-            + (
-                ''
-                if distances is None
-                else ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances)
-            )
-            + f', median {result["median_distance"]:.2f} m, at {result["speed"]:.2f} m/s',
-        ),
-        ('full length', f'{result["completion_rate"]:.0%} of the episodes'),
-        ('falls', f'{result["falls"]:.0%} of the episodes'),
-        ('made with', f'MuJoCo {result["mujoco"]} on {result["cpu"]}'),
-    )
-    print(spec.id)
-    for name, text in lines:
-        print(f'  {name:<12} {text}')
+        files.write_json({**result, **given}, arguments.json)
+    returns, distances = result['return_interval'], result['distance_interval']
+    around = '' if returns is None else f' +- {returns:.2f} (95 % confidence)'
+    between = ''
+    if distances is not None:
+        between = ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances)
+    text = """{id}
+  policy       {policy}
+  episodes     {episodes}, seed {seed}
+  return       {return:.2f}{around}, {normalized_return:.1%} of the maximum {step_limit}
+  length       {length:.1f} of {step_limit} steps
+  distance     {distance:.2f} m{between}, median {median_distance:.2f} m, at {speed:.2f} m/s
+  full length  {completion_rate:.0%} of the episodes
+  falls        {falls:.0%} of the episodes
+  made with    MuJoCo {mujoco} on {cpu}"""
+    print(text.format_map({**result, 'around': around, 'between': between}))
