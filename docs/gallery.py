@@ -298,11 +298,9 @@ def _run(id: str, look: Callable[[Environment], None]) -> None:
 
     time_step = environment.reset()
     seen()
-    with rendering.watching(environment, seen) as watched:
-        while count * FRAME < seconds and not time_step.last():
+    while count * FRAME < seconds and not time_step.last():
+        with rendering.calling_each_frame(environment, seen):
             time_step = environment.step(policy(time_step))
-            if not watched:
-                seen()
     environment.close()
 
 

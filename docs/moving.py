@@ -150,11 +150,9 @@ def _take(
     environment.random_state.seed(seed)
     time_step = environment.reset()
     look()
-    with rendering.watching(environment, look) as watched:
-        while count <= last and not time_step.last():
+    while count <= last and not time_step.last():
+        with rendering.calling_each_frame(environment, look):
             time_step = environment.step(policy(time_step))
-            if not watched:
-                look()
     return Shot(states, np.array(root), not time_step.last() or time_step.discount > 0)
 
 

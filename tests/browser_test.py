@@ -415,10 +415,10 @@ class ReplayTest(FolderTest):
 
             time_step = environment.reset()
             while states < 300:
-                with rendering.watching(environment, add) as watched:
+                with rendering.calling_each_frame(environment, add):
                     action = random.uniform(-largest, largest, environment.action_spec().shape)
                     time_step = environment.step(action)
-                if not watched or time_step.first():
+                if time_step.first():
                     add()
         self.assertLess(path.stat().st_size, 3e6)
         self.assertEqual(path.read_text(encoding='utf-8'), recording.html)

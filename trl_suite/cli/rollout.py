@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     import dm_env
 
     from trl_suite.environments.environment import Environment
+
+Stepping = Callable[[], contextlib.AbstractContextManager[None]]
 
 SHOWN_EPISODES = 8  # largest number of episodes that are printed
 _ENDS = ('fell', 'stuck', 'diverged')  # causes of an end of episode, in a task's info
@@ -89,11 +92,13 @@ def run(arguments: argparse.Namespace) -> None:
             if replay:
                 replay.add(jump=first)
 
-        watched = (video or replay) and stack.enter_context(rendering.watching(environment, look))
-        for done, time_step, action in _run(environment, policy, arguments.steps):
+        stepping: Stepping = contextlib.nullcontext
+        if video or replay:
+            stepping = functools.partial(rendering.calling_each_frame, environment, look)
+        for done, time_step, action in _run(environment, policy, arguments.steps, stepping):
             record.add(time_step, action)
-            if time_step.first() or not watched:
-                look(time_step.first())
+            if time_step.first():
+                look(first=True)
             if arguments.strip is not None and done in in_strip:
                 in_strip.discard(done)  # the next reset has the same number
                 pictures.append(picture())
@@ -111,9 +116,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _run(
-    environment: Environment, policy: rendering.Policy, steps: int
+    environment: Environment, policy: rendering.Policy, steps: int, stepping: Stepping
 ) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
-    """Yields the number of steps, every time step, and its action: zeros at ends of episodes."""
+    """Yields the number of steps, every time step, and its action: zeros at ends of episodes.
+
+    Steps are taken in contexts that `stepping` returns.
+    """
     import tqdm  # a dependency of dm_control
 
     from trl_suite.evaluation import PROGRESS_DELAY
@@ -130,7 +138,8 @@ def _run(
             if time_step.last():
                 time_step = environment.reset()
             else:
-                time_step = environment.step(action)
+                with stepping():
+                    time_step = environment.step(action)
                 done += 1
                 bar.update()
 

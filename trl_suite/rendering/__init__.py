@@ -2,13 +2,13 @@
 
 from trl_suite.rendering.drawing import (
     Policy,
+    calling_each_frame,
     check_gl,
     check_options,
     frame,
     frames,
     no_gl,
     replay,
-    watching,
 )
 from trl_suite.rendering.pictures import (
     IMAGE_SUFFIXES,
@@ -29,6 +29,7 @@ __all__ = [
     'VIDEO_SUFFIXES',
     'Policy',
     'Video',
+    'calling_each_frame',
     'check_gl',
     'check_options',
     'film_strip',
@@ -40,5 +41,4 @@ __all__ = [
     'replay',
     'spread',
     'video',
-    'watching',
 ]

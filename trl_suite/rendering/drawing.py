@@ -146,10 +146,8 @@ def frames(
             time_step = environment.reset()
             yield frame(environment, **options)
         within.clear()
-        with watching(environment, look) as watched:
+        with calling_each_frame(environment, look):
             time_step = environment.step(policy(time_step))
-        if not watched:
-            look()
         yield from within
 
 
@@ -184,25 +182,26 @@ def replay(
             if time_step.last():
                 time_step = environment.reset()
                 recording.add(jump=True)
-            with watching(environment, recording.add) as watched:
+            with calling_each_frame(environment, recording.add):
                 time_step = environment.step(policy(time_step))
-            if not watched:
-                recording.add()
     return recording
 
 
 @contextlib.contextmanager
-def watching(environment: composer.Environment, look: Callable[[], None]) -> Iterator[bool]:
-    """Calls `look` every 1/30 s if steps last longer than that; yields whether they do."""
+def calling_each_frame(
+    environment: composer.Environment, look: Callable[[], None]
+) -> Iterator[None]:
+    """Calls `look` every 1/30 s of a step that lasts longer than that, after another step once."""
     task: Any = environment.task
-    watched = hasattr(task, 'watch')
-    if watched:
-        task.watch = look
+    if not hasattr(task, 'watch'):
+        yield
+        look()
+        return
+    task.watch = look
     try:
-        yield watched
+        yield
     finally:
-        if watched:
-            task.watch = None
+        task.watch = None
 
 
 def _camera(model: Any, camera: str | int) -> int:

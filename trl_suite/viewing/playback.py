@@ -46,7 +46,7 @@ class Playback(dm_env.Environment):
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         environment = self._environment
         if not self._left:
-            with rendering.watching(
+            with rendering.calling_each_frame(
                 environment, lambda: self._left.append(environment.get_state())
             ):
                 self._end = environment.step(action)
