@@ -34,7 +34,6 @@ from trl_suite.util import files, interrupts, machine_code, notices
 from trl_suite.util.compiled import (
     compiled,
     compiled_inline,
-    compiled_loop,
     nearest_index,
     packed,
 )
@@ -60,9 +59,9 @@ ASK = 'from trl_suite.outer import outer; print(outer(1.0))'
 FOLDER = 'from trl_suite.util.compiled import cache_folder; print(cache_folder())'
 TUPLE = 'from typing import NamedTuple\nclass {}(NamedTuple):\n    array: object\n'
 FIRST = """
-from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.compiled import compiled
 
-@compiled_loop
+@compiled
 def first(pack):
     return pack.array[0]
 """
@@ -84,7 +83,7 @@ class Whole(NamedTuple):
     flag: bool
 
 
-@compiled_loop
+@compiled
 def mixed(whole):
     first, second = whole.pair.first, whole.pair.second
     return first[-1], second.shape[1], whole.count * whole.share, whole.flag
@@ -100,7 +99,7 @@ def scaled(i, pair):
     pair.second[i] = twice(pair.first[i]) / (i - 1)
 
 
-@compiled_loop
+@compiled
 def scale_all(env_ids, pair):
     for i in env_ids:
         scaled(i, pair)

@@ -16,7 +16,7 @@ from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.generators import BORDER
 from trl_suite.terrain.planar.windows import BEFORE, PlanarWindows
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes around its centre
 ADVANCE = 6.0  # m; window centres are multiples of it
@@ -208,7 +208,7 @@ class PlanarArena(composer.Arena):
         )  # fmt: skip
 
 
-@compiled_loop
+@compiled
 def is_laid(
     i: int, centre: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarWindows
 ) -> bool:
@@ -223,7 +223,7 @@ def is_laid(
     return True
 
 
-@compiled_loop
+@compiled
 def lay(
     i: int,
     centre: int,

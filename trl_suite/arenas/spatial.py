@@ -18,7 +18,7 @@ from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capac
 from trl_suite.terrain.spatial.ground import Random
 from trl_suite.terrain.spatial.surroundings import ALL, EnvIds, positions
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
-from trl_suite.util.compiled import compiled, compiled_loop, nearest_index, packed
+from trl_suite.util.compiled import compiled, nearest_index, packed
 
 ELEVATION = 40.0  # m; largest difference of heights of a grid within a window
 BASE = 1.0  # m; thickness of height fields below their lowest point
@@ -356,7 +356,7 @@ class SpatialArena(composer.Arena):
             self._physics = None
 
 
-@compiled_loop
+@compiled
 def _keep_moving(
     env_ids: np.ndarray, xy: np.ndarray, qpos: np.ndarray, qvel: np.ndarray,
     ground: SpatialWindows, sped: np.ndarray,

@@ -26,7 +26,7 @@ from trl_suite.controllers.machine import (
     stable_pd,
     touches,
 )
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled
 
 REGULARISATION = 1e-4  # of the contact forces that support the weight
 LAST = STATES - 1
@@ -255,14 +255,14 @@ def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def begin_all(env_ids: np.ndarray, vector: np.ndarray, gait: GaitRules) -> None:
     """Resets state machines to the start of their first cycle."""
     for i in env_ids:
         begin(i, vector, gait)
 
 
-@compiled_loop
+@compiled
 def apply_all(env_ids: np.ndarray, vectors: np.ndarray, gait: GaitRules) -> None:
     """Begins cycles with parameters (m, P)."""
     for row in range(len(env_ids)):
@@ -271,14 +271,14 @@ def apply_all(env_ids: np.ndarray, vectors: np.ndarray, gait: GaitRules) -> None
         apply(env_ids[row], gait)
 
 
-@compiled_loop
+@compiled
 def act_all(env_ids: np.ndarray, gait: GaitRules) -> None:
     """Writes the torques of the next control step."""
     for i in env_ids:
         act(i, gait)
 
 
-@compiled_loop
+@compiled
 def advance_all(env_ids: np.ndarray, gait: GaitRules, ended: np.ndarray) -> None:
     """Advances state machines; writes whether their cycles have ended, (m,)."""
     for row in range(len(env_ids)):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_inline
 
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _NONE, _BODY, _INERTIA, _BODY_ROTATION, _INERTIA_ROTATION = (
@@ -83,7 +83,7 @@ def refresh(body: int, geoms: Geoms) -> None:
             _bound_children(node, left, right, geoms.bvh_aabb)
 
 
-@compiled_loop
+@compiled
 def refresh_all(bodies: np.ndarray, geoms: Geoms) -> None:
     """Updates the bounds of the geoms of bodies; takes a pack."""
     for body in bodies:

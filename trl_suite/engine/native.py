@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from trl_suite.engine import memory, motors, pushes
-from trl_suite.util.compiled import Compiled, compiled, compiled_loop
+from trl_suite.util.compiled import Compiled, compiled
 
 # Functions of type void f(const mjModel*, mjData*), in the order of `Engine.functions`.
 NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData', 'mj_fwdActuation')
@@ -240,28 +240,28 @@ def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def step_all(env_ids: np.ndarray, nstep: int, engine: Engine) -> None:
     """Advances simulations by `nstep` physics steps each."""
     for i in env_ids:
         step(i, nstep, engine)
 
 
-@compiled_loop
+@compiled
 def forward_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Recomputes all quantities that depend on the states of simulations."""
     for i in env_ids:
         forward(i, engine)
 
 
-@compiled_loop
+@compiled
 def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Resets simulations to the model's initial state."""
     for i in env_ids:
         reset(i, engine)
 
 
-@compiled_loop
+@compiled
 def diverged_all(engine: Engine, out: np.ndarray) -> bool:
     """Writes which simulations have diverged; returns whether any has."""
     found = False

@@ -11,7 +11,7 @@ from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.engine import native
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled
 
 MAX_JOINT_SPEED = 200.0  # rad/s; above it a simulation counts as diverged
 _UPRIGHT = np.pi / 2  # rad; below this pitch a trunk points forwards
@@ -229,7 +229,7 @@ def breaks_down(i: int, body: PlanarBodyData) -> bool:
     )
 
 
-@compiled_loop
+@compiled
 def control_all(env_ids: np.ndarray, action: np.ndarray, body: PlanarBodyData) -> int:
     """Writes controls; returns how many ground windows must be moved. Takes a pack."""
     leaving = 0

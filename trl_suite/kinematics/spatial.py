@@ -17,7 +17,7 @@ from trl_suite.engine import native
 from trl_suite.kinematics.planar import MAX_JOINT_SPEED
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SpatialWindows
-from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_inline
 
 LINK_POSE, LINK_VELOCITY = 7, 6  # numbers of each link in the blocks pose and velocity
 
@@ -313,7 +313,7 @@ def breaks_down(i: int, body: SpatialBodyData) -> bool:
     )
 
 
-@compiled_loop
+@compiled
 def control_all(env_ids: np.ndarray, action: np.ndarray, body: SpatialBodyData) -> int:
     """Writes controls and drives moving boxes; returns how many ground windows must be moved.
 
@@ -340,7 +340,7 @@ class Measured(NamedTuple):
     measurement: SpatialMeasurement
 
 
-@compiled_loop
+@compiled
 def measure_all(env_ids: np.ndarray, measured: Measured) -> None:
     """Measures the characters of some simulations; takes a pack."""
     for i in env_ids:

@@ -40,7 +40,7 @@ from trl_suite.policies.mirror import blocks as mirrored_blocks
 from trl_suite.policies.mirror import exchanged
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES, SpatialWindows, see_movers
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 
 CLEARANCE = 0.001  # m; between links and ground after the initial placement
 # Reflection of a map, whose lines are from left to right.
@@ -295,7 +295,7 @@ def put_down(
     native.forward(i, engine)
 
 
-@compiled_loop
+@compiled
 def put_down_all(
     env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray,
     corners: Corners, measured: Measured, engine: Engine,

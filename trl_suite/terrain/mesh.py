@@ -20,7 +20,7 @@ from trl_suite.terrain.planar.ground import PlanarGround
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Boxes
 from trl_suite.util import errors
-from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.compiled import compiled
 from trl_suite.util.files import LARGEST, check_path, read_bytes, replacing
 from trl_suite.util.libraries import library
 
@@ -271,7 +271,7 @@ def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
     return heights
 
 
-@compiled_loop
+@compiled
 def _raise_heights(
     triangles: np.ndarray, spans: np.ndarray, x: np.ndarray, y: np.ndarray, heights: np.ndarray
 ) -> None:

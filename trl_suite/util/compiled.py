@@ -16,8 +16,7 @@ an index is computed from a state of the physics by `nearest_index`. With `NUMBA
 index raises an IndexError. It runs without the global interpreter lock.
 
 A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
-in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
-tuples of arrays are passed to them as packs, see `packed`.
+in every caller. Python passes tuples of arrays to loops over simulations as packs, see `packed`.
 
 Numba is imported and a function is compiled when it is first called. Its machine code is kept in the
 folder trl_suite/kernels/HASH in `$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends
@@ -123,11 +122,6 @@ def compiled(function: Callable[..., Any]) -> Compiled:
 def compiled_inline(function: Callable[..., Any]) -> Compiled:
     """Decorates a small function that other compiled functions call in inner loops."""
     return Compiled(function, inline=True)
-
-
-def compiled_loop(function: Callable[..., Any]) -> Compiled:
-    """Decorates a loop over simulations that Python calls with packs; see `packed`."""
-    return Compiled(function)
 
 
 @compiled_inline

@@ -11,7 +11,7 @@ from trl_suite.kinematics.spatial import SpatialBodyData, look
 from trl_suite.tasks.task import CONTROL_TIMESTEP, PHASE_BINS, Outcome
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
-from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_inline
 
 TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 HEIGHT_MAP = "observed map of the terrain: 'height', or () for none"
@@ -151,7 +151,7 @@ def publish(i: int, view: View, outcome: Outcome) -> None:
         observation[i, view.given_phase] = 2 * (phase - 0.5 if left else phase)
 
 
-@compiled_loop
+@compiled
 def reflect_all(env_ids: np.ndarray, action: np.ndarray, view: View) -> None:
     """Writes `view.action`: actions, which are reflected in left stance. Takes a pack."""
     for i in env_ids:

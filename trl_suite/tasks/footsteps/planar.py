@@ -33,7 +33,7 @@ from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, Planar
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
 from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar import windows as planar_ground
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option
 from trl_suite.util.random import Streams, random, uniform
 
@@ -213,21 +213,21 @@ def draw_plan(i: int, data: ImitationData, plan: Plan, options: Options) -> None
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def draw_plans(env_ids: np.ndarray, data: ImitationData, plan: Plan, options: Options) -> None:
     """Draws the first plans of some simulations."""
     for i in env_ids:
         draw_plan(i, data, plan, options)
 
 
-@compiled_loop
+@compiled
 def finish_steps(env_ids: np.ndarray, data: ImitationData, plan: Plan, options: Options) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish_step(i, data, plan, options)
 
 
-@compiled_loop
+@compiled
 def observe_all(
     env_ids: np.ndarray, fresh: bool, data: ImitationData, plan: Plan, options: Options
 ) -> None:

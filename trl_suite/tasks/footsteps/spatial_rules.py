@@ -32,7 +32,7 @@ from trl_suite.tasks.components.spatial_rules import (
 )
 from trl_suite.tasks.task import Outcome, conclude
 from trl_suite.tasks.terms import Term, facing, give, score, wrapped
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled
 
 TERMS = (
     *STEP_TERMS,
@@ -190,7 +190,7 @@ def observe(i: int, data: FootstepData) -> None:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def land_all(env_ids: np.ndarray, data: FootstepData) -> int:
     """Detects landings; returns how many simulations need a new plan."""
     switched = 0
@@ -199,14 +199,14 @@ def land_all(env_ids: np.ndarray, data: FootstepData) -> int:
     return switched
 
 
-@compiled_loop
+@compiled
 def finish_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish(i, data)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:

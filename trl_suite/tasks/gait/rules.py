@@ -28,7 +28,7 @@ from trl_suite.tasks.task import (
 )
 from trl_suite.tasks.terms import Term, give, score
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.compiled import compiled
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
 SUBSTEPS = 2  # physics steps per control step: 1/1200 s
@@ -362,14 +362,14 @@ def begin_episode(i: int, rules: Rules) -> None:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> None:
     """Begins steps."""
     for i in env_ids:
         begin_step(i, action, rules)
 
 
-@compiled_loop
+@compiled
 def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
     """Continues steps; returns how many were interrupted."""
     interrupted = 0
@@ -379,14 +379,14 @@ def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
     return interrupted
 
 
-@compiled_loop
+@compiled
 def finish_steps(env_ids: np.ndarray, rules: Rules) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish_step(i, rules)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> None:
     """Writes observations; if `fresh`, episodes have just begun, and their state is reset."""
     for i in env_ids:

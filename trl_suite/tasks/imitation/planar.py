@@ -47,7 +47,7 @@ from trl_suite.tasks.task import (
 )
 from trl_suite.tasks.terms import score, terms_data, wrapped
 from trl_suite.terrain import PlanarGround
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option
 
 VIEW_BEHIND = 0.5  # m; terrain samples begin this far behind the root
@@ -190,14 +190,14 @@ def motion_blocks(muscles: int, links: int, reference: bool) -> tuple[Block, ...
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def finish_steps(env_ids: np.ndarray, data: ImitationData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish_step(i, data)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, fresh: bool, data: ImitationData) -> None:
     """Writes observations; if `fresh`, episodes have just begun, and outcomes are reset."""
     for i in env_ids:

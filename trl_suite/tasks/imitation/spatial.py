@@ -40,7 +40,7 @@ from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
 from trl_suite.tasks.task import Outcome, conclude, drawn_seed
 from trl_suite.tasks.terms import score
 from trl_suite.terrain import SpatialGround
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option
 
 GOAL_AHEAD = (
@@ -138,14 +138,14 @@ def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def finish_steps(env_ids: np.ndarray, data: ImitationData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish_step(i, data)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, data: ImitationData) -> None:
     """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:

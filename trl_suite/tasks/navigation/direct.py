@@ -60,7 +60,7 @@ from trl_suite.tasks.imitation.spatial import check_cycle, clip_action, cycle_po
 from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask
 from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, Outcome, conclude
 from trl_suite.tasks.terms import Term, facing, give, score, wrapped
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Range, option
 
 REWARDS = ('goal', 'original')
@@ -214,7 +214,7 @@ def observe(i: int, data: DirectData) -> None:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     """Tests goals and balls; returns in how many simulations one must be redrawn."""
     wanted = 0
@@ -223,14 +223,14 @@ def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     return wanted
 
 
-@compiled_loop
+@compiled
 def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish(i, data)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, fresh: bool, data: DirectData) -> None:
     """Measures, writes reward terms for the current state, and observes.
 

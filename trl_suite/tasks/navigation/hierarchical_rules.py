@@ -35,7 +35,7 @@ from trl_suite.tasks.task import CONTROL_TIMESTEP, Outcome, conclude
 from trl_suite.tasks.terms import Term, give
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
-from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop
+from trl_suite.util.compiled import compiled, compiled_inline
 
 CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
 MAPS = ('height', 'velocity')
@@ -295,14 +295,14 @@ def observe(i: int, data: PlanningData) -> None:
 # Loops over simulations; they take packs.
 
 
-@compiled_loop
+@compiled
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Begins steps."""
     for i in env_ids:
         begin_step(i, action, data)
 
 
-@compiled_loop
+@compiled
 def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
@@ -312,7 +312,7 @@ def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> N
         observe(i, data)
 
 
-@compiled_loop
+@compiled
 def finish_control_steps(env_ids: np.ndarray, data: PlanningData) -> int:
     """Finishes a control step; returns how many steps continue."""
     going = 0
@@ -321,7 +321,7 @@ def finish_control_steps(env_ids: np.ndarray, data: PlanningData) -> int:
     return going
 
 
-@compiled_loop
+@compiled
 def score_all(env_ids: np.ndarray, data: PlanningData) -> int:
     """Writes reward terms; returns in how many simulations goal or ball must be redrawn."""
     wanted = 0
@@ -330,14 +330,14 @@ def score_all(env_ids: np.ndarray, data: PlanningData) -> int:
     return wanted
 
 
-@compiled_loop
+@compiled
 def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish(i, data)
 
 
-@compiled_loop
+@compiled
 def observe_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Observes."""
     for i in env_ids:

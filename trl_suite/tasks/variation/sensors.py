@@ -19,7 +19,7 @@ from trl_suite.kinematics.blocks import LEVELS, Block, layout
 from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
 from trl_suite.tasks.task import Outcome, Task
 from trl_suite.util import errors
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, Range, checked, option
 from trl_suite.util.random import random, standard_normal
 
@@ -267,7 +267,7 @@ def observe(i: int, rules: SensorRules) -> None:
         state.observation[i, k] = 0.0 if state.missing[i, k] else value
 
 
-@compiled_loop
+@compiled
 def sense_all(env_ids: np.ndarray, kind: int, rules: SensorRules) -> None:
     """Writes what is observed in simulations: `FRESH`, `NEXT` or `AGAIN`. Takes a pack."""
     depth = rules.state.history.shape[1]

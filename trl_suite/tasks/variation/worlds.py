@@ -20,7 +20,7 @@ from trl_suite.engine.variation import Properties, Variation
 from trl_suite.tasks.component import PUSH, WORLD, Component, seeded, spawned
 from trl_suite.tasks.task import Marker, Outcome, Task
 from trl_suite.util import errors
-from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.compiled import compiled
 from trl_suite.util.options import Config, Range, option
 
 PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
@@ -301,7 +301,7 @@ class Worlds(Component):
         return [Marker('arrow', place, (0.03, 0.03, length), PUSH_COLOUR, yaw)]
 
 
-@compiled_loop
+@compiled
 def first_push(env_ids: np.ndarray, engine: Any) -> None:
     """Draws the first push of episodes, which begin at time 0; takes the pack of a world."""
     for i in env_ids:

@@ -39,7 +39,7 @@ from trl_suite.tasks.task import (
     drawn_seed,
 )
 from trl_suite.terrain import PlanarGround, SpatialGround
-from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option
 
 FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
@@ -88,7 +88,7 @@ def observe_planar(i: int, data: PlanarWalkData) -> None:
     data.state.distance[i] = body.physics.qpos[i, body.ids.qpos[0]] - data.state.origin[i, 0]
 
 
-@compiled_loop
+@compiled
 def finish_planar(env_ids: np.ndarray, stepped: bool, data: PlanarWalkData) -> None:
     """Finishes steps, or only observes."""
     for i in env_ids:
@@ -128,7 +128,7 @@ TARGET_HEADING = Block(
 )  # fmt: skip
 
 
-@compiled_loop
+@compiled
 def finish_spatial(env_ids: np.ndarray, stepped: bool, data: SpatialWalkData) -> None:
     """Finishes steps, or only observes."""
     for i in env_ids:
