@@ -60,7 +60,7 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
         planned = footsteps.action_offset + footsteps.action_scale * action
         root, yaw = found.root[env_ids], found.heading[env_ids]
         for which in range(2):
-            place = root[:, :2] + quaternion.turned(planned[:, 2 * which : 2 * which + 2], yaw)
+            place = root[:, :2] + quaternion.rotate_xy(planned[:, 2 * which : 2 * which + 2], yaw)
             landing[env_ids, which, :2] = place
             height = task.arena.height(place[:, :1], place[:, 1:], env_ids)
             landing[env_ids, which, 2] = height[:, 0]
@@ -79,7 +79,7 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
             foot = stance if which else 1 - stance
             away = landing[:, which, :2] - found.feet[everyone, foot, :2]
             slot = 6 * which + 3 * foot
-            ahead, left = quaternion.turned(away, -found.heading).T
+            ahead, left = quaternion.rotate_xy(away, -found.heading).T
             parts['plan'][everyone, slot], parts['plan'][everyone, slot + 1] = ahead, left
             parts['plan'][everyone, slot + 2] = landing[:, which, 2] - found.under
         parts['plan'][:, -1] = wrap(heading - found.heading)

@@ -233,7 +233,8 @@ class SelectionTest(parameterized.TestCase):
             left.append(places[1])
             target.append(library.landing(i, mirrored)[:2])
         turned = [
-            quaternion.turned(np.array(way), heading) + shift for way in (root, right, left, target)
+            quaternion.rotate_xy(np.array(way), heading) + shift
+            for way in (root, right, left, target)
         ]
         root, right, left, target = turned
         turn = library.landing(np.arange(len(library)), mirrored)[:, 2]
@@ -369,7 +370,7 @@ class RecipesTest(parameterized.TestCase):
         for this, before, after in zip(steps[1:], table, table[1:], strict=False):
             start = made.layout.mirror.pose(after)[:3]
             turn = quaternion.about_z(np.array(this.turn))
-            start[:, :2] = quaternion.turned(start[:, :2], this.turn)
+            start[:, :2] = quaternion.rotate_xy(start[:, :2], this.turn)
             start[:, :2] += this.length, this.width
             start[:, 3:7] = quaternion.multiply(turn, start[:, 3:7])
             end = before[-3:]

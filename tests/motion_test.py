@@ -127,7 +127,7 @@ class SamplingTest(parameterized.TestCase):
         np.testing.assert_allclose(found[:, 7:], [first[7:]] * 6, atol=1e-12)
         # Each cycle is the one before it, moved.
         for axis in (0, 1):
-            expected = quaternion.turned(np.tile(first[:2], (6, 1)), cycles * turn)[:, axis]
+            expected = quaternion.rotate_xy(np.tile(first[:2], (6, 1)), cycles * turn)[:, axis]
             np.testing.assert_allclose(found[:, axis], expected, atol=1e-6)
 
     @parameterized.parameters(0.9, -2.5)

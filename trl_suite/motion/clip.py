@@ -164,8 +164,8 @@ class Clip:
         small = abs(turn) < _STRAIGHT
         chord = cycle if small else np.sin(angle / 2) / np.sin(turn / 2)
         start, way = self.poses[0, :3], self.displacement
-        shift = quaternion.turned(way[:2], (angle - turn) / 2) * chord[..., None]
-        poses[..., :2] = quaternion.turned(poses[..., :2] - start[:2], angle) + start[:2] + shift
+        shift = quaternion.rotate_xy(way[:2], (angle - turn) / 2) * chord[..., None]
+        poses[..., :2] = quaternion.rotate_xy(poses[..., :2] - start[:2], angle) + start[:2] + shift
         poses[..., 2] += cycle * way[2]
         poses[..., 3:7] = quaternion.multiply(quaternion.about_z(angle), poses[..., 3:7])
         return poses

@@ -100,7 +100,7 @@ def heading(q: np.ndarray) -> np.ndarray:
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def turned(way: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def rotate_xy(way: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns (x, y) rotated by an angle about the vertical; broadcasts (..., 2) and (...)."""
     x, y, cos, sin = way[..., 0], way[..., 1], np.cos(angle), np.sin(angle)
     result = np.empty((*np.broadcast_shapes(x.shape, np.shape(angle)), 2))

@@ -200,7 +200,8 @@ def features(
     turn = np.arctan2(np.sin(turn), np.cos(turn))
     ways = (stance - root, swing - root, target - stance)
     seen = np.concatenate(
-        [*(quaternion.turned(way, -np.asarray(heading)) for way in ways), turn[..., None]], axis=-1
+        [*(quaternion.rotate_xy(way, -np.asarray(heading)) for way in ways), turn[..., None]],
+        axis=-1,
     )
     return seen * np.where(side, 1, _REFLECTED)
 

@@ -131,7 +131,7 @@ def retarget(
         size = standing / path[:, 2].max() if scale is None else scale
     yaw = _yaw(path, turns)
     path = path - [*path[0, :2], 0]
-    path[:, :2] = quaternion.turned(path[:, :2], np.full(len(path), -yaw))
+    path[:, :2] = quaternion.rotate_xy(path[:, :2], np.full(len(path), -yaw))
     upright = quaternion.about_z(np.full(len(path), -yaw))
     if layout.root == 'planar':  # no heading: the motion is along x
         aside = quaternion.angle_about(quaternion.multiply(upright, turns), _VERTICAL)

@@ -274,7 +274,7 @@ class SpatialFootsteps(TrackingTask):
         now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
         turned = measurement.heading[env_ids] - now[:, columns['heading'].start]
         self.state.turned[env_ids] = turned
-        self.state.shift[env_ids] = measurement.root[env_ids, :2] - quaternion.turned(
+        self.state.shift[env_ids] = measurement.root[env_ids, :2] - quaternion.rotate_xy(
             now[:, columns['root']], turned
         )
 
@@ -297,7 +297,7 @@ class SpatialFootsteps(TrackingTask):
         time = self.step_phase[env_id] * self.steps.duration
         pose = self.steps.pose(index, time, bool(mirrored))
         turned = state.turned[env_id]
-        pose[:2] = state.shift[env_id] + quaternion.turned(pose[:2], turned)
+        pose[:2] = state.shift[env_id] + quaternion.rotate_xy(pose[:2], turned)
         pose[3:7] = quaternion.multiply(quaternion.about_z(turned), pose[3:7])
         env_ids = np.array([env_id])
         pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]

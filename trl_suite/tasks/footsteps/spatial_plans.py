@@ -77,9 +77,9 @@ class Planner:
             self._head_for_goals(env_ids, measurement.root[env_ids, :2])
         else:
             # The feet land on both sides of a line through the start, at half a width from it.
-            line = quaternion.turned(anchors - places, -angles)
+            line = quaternion.rotate_xy(anchors - places, -angles)
             line[:, 1] = 0.5 * SIDE[stance] * aside
-            anchors = places + quaternion.turned(line, angles)
+            anchors = places + quaternion.rotate_xy(line, angles)
         for which, foot in enumerate((1 - stance, stance)):
             anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
 
@@ -169,7 +169,7 @@ class Planner:
         """
         steps = sizes.copy()
         steps[:, 1] *= SIDE[feet]
-        places = places + quaternion.turned(steps, self._plan.heading[env_ids])
+        places = places + quaternion.rotate_xy(steps, self._plan.heading[env_ids])
         self._plan.landing[env_ids, which, :2] = places
         heights = self._arena.height(places[:, :1], places[:, 1:], env_ids)
         self._plan.landing[env_ids, which, 2] = heights[:, 0]
