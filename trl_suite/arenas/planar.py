@@ -105,7 +105,7 @@ class PlanarArena(composer.Arena):
 
         Args:
           x: positions of their roots, m, (n, 1), or of the given simulations only, (m, 1).
-          env_ids: sorted numbers of simulations; None for all.
+          env_ids: sorted indices of simulations; None for all.
         """
         env_ids = self._numbers if env_ids is None else env_ids
         far = np.abs(x[:, 0] - self.ground.centre[env_ids]) > self.ground.reach

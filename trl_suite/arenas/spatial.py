@@ -164,7 +164,7 @@ class SpatialArena(composer.Arena):
         """Replaces the ground of one simulation; the caller forwards the world afterwards.
 
         Args:
-          env_id: number of the simulation, which may be reset before or after this call.
+          env_id: index of the simulation, which may be reset before or after this call.
           ground: the new ground.
           xy: start position of its character, m.
         """
@@ -181,7 +181,7 @@ class SpatialArena(composer.Arena):
 
         Args:
           xy: positions of their roots, m, (n, 2), or of the given simulations only, (m, 2).
-          env_ids: sorted numbers of simulations; None for all.
+          env_ids: sorted indices of simulations; None for all.
 
         Raises:
           ValueError: positions of another shape.

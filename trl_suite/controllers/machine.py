@@ -166,7 +166,7 @@ def stable_pd(i: int, free: int, gait: GaitRules) -> None:
     """Writes the torques of stable PD control, which predicts one control step ahead.
 
     Args:
-      i: number of the simulation.
+      i: index of the simulation.
       free: number of a joint without torque; J for none.
       gait: the data.
     """

@@ -100,7 +100,7 @@ def advance(i: int, time: float, duration: float, pushes: Pushes) -> bool:
     """Writes the mean force of a period to `scratch[i, 3:]`, and draws pushes that follow in it.
 
     Args:
-      i: number of the simulation.
+      i: index of the simulation.
       time: start of the period, s.
       duration: its duration, s.
       pushes: the pushes.

@@ -137,7 +137,7 @@ class World:
         self.pack = packed(self.engine)
         return made.state
 
-    # Methods for tasks; env_ids are sorted numbers of simulations, without repeats. Those that do not
+    # Methods for tasks; env_ids are sorted indices of simulations, without repeats. Those that do not
     # exist raise an IndexError.
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
@@ -195,7 +195,7 @@ class World:
 
         Args:
           work: called with parts of env_ids; its results must not depend on how these are split.
-          env_ids: sorted numbers of simulations.
+          env_ids: sorted indices of simulations.
 
         Raises:
           Exception: the first exception that `work` raised, after all parts have finished.

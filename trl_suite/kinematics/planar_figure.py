@@ -172,7 +172,7 @@ class PlanarFigure:
         middle and both ends of each; never lowered.
 
         Args:
-          env_ids: numbers of simulations, which are reset.
+          env_ids: indices of simulations, which are reset.
           poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); x and
             z are overwritten with those of the placement.
           rates: velocities, (m, 3 + J).

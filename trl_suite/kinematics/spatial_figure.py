@@ -190,7 +190,7 @@ class SpatialFigure:
         lowered.
 
         Args:
-          env_ids: numbers of simulations whose physics has been reset.
+          env_ids: indices of simulations whose physics has been reset.
           poses: free root, with z above the ground, then joints in link order, (m, columns of a
             pose).
           rates: velocities, (m, columns of a velocity).

@@ -50,7 +50,7 @@ class GoalDrawer:
         """Places the ball of a simulation, and draws the first goal of its episode.
 
         Args:
-          i: number of the simulation.
+          i: index of the simulation.
           place: position of the walker, (2,) m.
         """
         if self._ball:
@@ -61,7 +61,7 @@ class GoalDrawer:
         """Places balls and draws goals again, where they have expired or were reached.
 
         Args:
-          env_ids: numbers of simulations.
+          env_ids: indices of simulations.
           places: positions of the walkers of all simulations, (n, 2) m.
         """
         if self._ball:

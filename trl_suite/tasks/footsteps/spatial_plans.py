@@ -57,7 +57,7 @@ class Planner:
         """Draws the first plans of episodes, and their first goals.
 
         Args:
-          env_ids: numbers of simulations, (m,), whose stance feet are known.
+          env_ids: indices of simulations, (m,), whose stance feet are known.
           origins: start positions x, y (m) and headings (rad), (m, 3).
           measurement: measurement of the characters.
         """
@@ -87,7 +87,7 @@ class Planner:
         """Draws the next plans of some simulations at a switch of stance.
 
         Args:
-          env_ids: numbers of simulations, (m,).
+          env_ids: indices of simulations, (m,).
           measurement: measurement of the characters.
         """
         plans, plan, count = self._plans, self._plan, len(env_ids)
@@ -158,7 +158,7 @@ class Planner:
         """Writes one landing place to each plan: a step from the position of the other foot.
 
         Args:
-          env_ids: numbers of simulations, (m,).
+          env_ids: indices of simulations, (m,).
           which: which of the plan's two landing places, 0 or 1.
           feet: the feet that step, (m,).
           places: positions of the other feet, (m, 2) m.

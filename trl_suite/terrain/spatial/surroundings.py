@@ -113,7 +113,7 @@ class Surroundings:
         """Assigns a new ground to a character, with moving boxes at their initial places.
 
         Args:
-          env_id: number of the simulation.
+          env_id: index of the simulation.
           ground: ground whose terrain fits the capacity given to the constructor.
           xy: position of the character, m.
 
@@ -152,7 +152,7 @@ class Surroundings:
 
         Args:
           xy: positions of the characters, m, (n, 2), or of the given simulations only.
-          env_ids: sorted numbers of simulations; None for all.
+          env_ids: sorted indices of simulations; None for all.
 
         Returns:
           The simulations whose windows were refilled. Those of a character beyond `BORDER` stay
@@ -175,7 +175,7 @@ class Surroundings:
         Args:
           dt: duration, s.
           xy: positions of the characters of these simulations, m.
-          env_ids: numbers of the simulations.
+          env_ids: indices of the simulations.
         """
         self.distance[env_ids] += self.direction[env_ids] * self.speed[env_ids] * dt
         self.turn(xy, env_ids)
@@ -226,7 +226,7 @@ class Surroundings:
         Args:
           xy: positions of the characters, m, (simulations, 2).
           heading: rad, (simulations,).
-          env_ids: numbers of the simulations.
+          env_ids: indices of the simulations.
           out: array for the result, (simulations, 1024).
 
         Returns:

@@ -155,7 +155,7 @@ def height_map(
     Sample 32 v + u is the u-th from behind of the v-th line from the left; see `Surroundings`.
 
     Args:
-      i: number of the simulation.
+      i: index of the simulation.
       x, y: position of the character, m.
       heading: rad.
       ground: windows of all simulations.
@@ -268,7 +268,7 @@ def keep_moving(
     squeeze a leg between them with any force.
 
     Args:
-      i: number of the simulation.
+      i: index of the simulation.
       x, y: position of its character, m.
       qpos, qvel: positions and velocities of all simulations; qvel is written.
       ground: windows of all simulations.
