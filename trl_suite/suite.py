@@ -104,7 +104,7 @@ def build(
     actuation: str | None = None,
     terrain: Any = None,
     task: str | TaskType | Callable[..., Task] = 'imitation',
-    clip: str | motion.Clip | motion.Steps | None = None,
+    clip: str | motion.Clip | motion.FootstepLibrary | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
@@ -127,7 +127,7 @@ def combine(
     actuation: str | None = None,
     terrain: Any = None,
     task: str | TaskType | Callable[..., Task] = 'imitation',
-    clip: str | motion.Clip | motion.Steps | None = None,
+    clip: str | motion.Clip | motion.FootstepLibrary | None = None,
 ) -> EnvSpec:
     """Returns the `EnvSpec` of a combination, which `VectorEnvironment` and Gymnasium accept.
 
@@ -144,8 +144,9 @@ def combine(
         called as task(character, arena, actuation_model=...), with clip=... if one is given, and
         with the task's options as keyword arguments, and returns a `Task`.
       clip: the reference motion. For imitation: name of a clip, path of an .npz, or a `Clip`; for
-        footsteps in three dimensions: name or path of a library of steps, or a `Steps`. By default
-        the character's own. The tasks 'gait' and 'walk' have no reference motion.
+        footsteps in three dimensions: name or path of a library of footsteps, or a
+        `FootstepLibrary`. By default the character's own. The tasks 'gait' and 'walk' have no
+        reference motion.
 
     Raises:
       ValueError: unknown names, or parts that are incompatible.
@@ -156,8 +157,8 @@ def combine(
             f'a character is a CharacterSpec or a name, one of {", ".join(characters.CHARACTERS)}; '
             f'not {character!r}'
         )
-    if not isinstance(clip, (str, motion.Clip, motion.Steps, type(None))):
-        raise TypeError(f'clip is a name, a file, a Clip or Steps, not {clip!r}')
+    if not isinstance(clip, (str, motion.Clip, motion.FootstepLibrary, type(None))):
+        raise TypeError(f'clip is a name, a file, a Clip or FootstepLibrary, not {clip!r}')
     if not isinstance(character, str):
         own['character'], character = character, character.name
     elif character not in characters.CHARACTERS:
@@ -184,7 +185,7 @@ def combine(
     if terrain is None:
         terrain = 'plane' if figure.spatial else 'flat'
     if isinstance(clip, str) and clip.endswith('.npz'):  # read once: the working folder may change
-        steps = type_ is not None and type_.motion is motion.Steps
+        steps = type_ is not None and type_.motion is motion.FootstepLibrary
         clip = motion.load_steps(clip) if steps else motion.load(clip)
     if clip is not None and not isinstance(clip, str):
         own['clip'], clip = clip, clip.name

@@ -21,7 +21,7 @@ def clips() -> list[motion.Clip]:
     return [clip for recipe in RECIPES for clip in recipe.clips()]
 
 
-def libraries() -> list[motion.Steps]:
+def libraries() -> list[motion.FootstepLibrary]:
     """Returns all step libraries."""
     return [library for recipe in RECIPES for library in recipe.libraries()]
 

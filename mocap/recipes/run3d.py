@@ -142,7 +142,7 @@ def clips() -> list[motion.Clip]:
     return [clip(name) for name in RUNS]
 
 
-def library() -> motion.Steps:
+def library() -> motion.FootstepLibrary:
     """Returns the first half of the run in lighter legs as a library of one step."""
     made = RUNS['biped3d_mocap_run']
     body = figure3d.figure(made.character)
@@ -151,7 +151,7 @@ def library() -> motion.Steps:
     table = body.poses(found)
     table[:, :2] += -made.shape['xl'], LINE  # the position of the flat stance foot is the origin
     label = (made.speed * made.period / 2, 2 * LINE, 0.0)
-    return motion.Steps(
+    return motion.FootstepLibrary(
         name=made.character,
         times=made.period * phase,
         poses=table[None],
@@ -164,6 +164,6 @@ def library() -> motion.Steps:
     )
 
 
-def libraries() -> list[motion.Steps]:
+def libraries() -> list[motion.FootstepLibrary]:
     """Returns the step libraries of this recipe."""
     return [library()]

@@ -258,7 +258,7 @@ def walk(name: str, character: str, this: Step, shape: str = '') -> motion.Clip:
     )
 
 
-def library(name: str, shape: str = '') -> motion.Steps:
+def library(name: str, shape: str = '') -> motion.FootstepLibrary:
     """Returns the step library of a character: straight, wide and turning, all after `USUAL`."""
     made, p = figure3d.figure(name), SHAPES[shape or name]
     u = np.linspace(0, 1, round(STEP_RATE * STEP) + 1)
@@ -269,7 +269,7 @@ def library(name: str, shape: str = '') -> motion.Steps:
         labels.append((this.length, this.width, this.turn))
         features.append(figure3d.features(made, bodies, this.turn))
     usual = (USUAL.length, USUAL.width, USUAL.turn)
-    return motion.Steps(
+    return motion.FootstepLibrary(
         name=name,
         times=STEP * u,
         poses=np.array(poses),
@@ -303,6 +303,6 @@ def clips() -> list[motion.Clip]:
     ]
 
 
-def libraries() -> list[motion.Steps]:
+def libraries() -> list[motion.FootstepLibrary]:
     """Returns the step libraries of this recipe; both bodies have the same legs."""
     return [library('biped3d_mocap'), library('biped3d_full_mocap', 'biped3d_mocap')]

@@ -20,7 +20,7 @@ from trl_suite.kinematics.spatial import (
     feature_columns,
     measure_all,
 )
-from trl_suite.motion import Clip, Steps, quaternion
+from trl_suite.motion import Clip, FootstepLibrary, quaternion
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util.compiled import compiled_inline, nearest_index, packed
 
@@ -121,7 +121,9 @@ class SpatialReference:
         return cls(body, model, clip.pose(times)[None], clip.velocity(times)[None])
 
     @classmethod
-    def of_steps(cls, steps: Steps, body: SpatialIds, model: mujoco.MjModel) -> SpatialReference:
+    def of_steps(
+        cls, steps: FootstepLibrary, body: SpatialIds, model: mujoco.MjModel
+    ) -> SpatialReference:
         """Returns a reference with a library's k steps in right stance, then their mirror images."""
         times = np.linspace(0, steps.duration, STEP_SAMPLES + 1)
         index = np.tile(np.arange(len(steps)), 2)[:, None]
@@ -161,7 +163,7 @@ def _continuous(features: np.ndarray, rotations: slice) -> np.ndarray:
     return features.reshape(-1, features.shape[2])
 
 
-def mean_targets(clip_poses: np.ndarray, clip: Clip | Steps) -> np.ndarray:
+def mean_targets(clip_poses: np.ndarray, clip: Clip | FootstepLibrary) -> np.ndarray:
     """Returns the mean target of every degree of freedom over poses and their mirror images.
 
     Args:

@@ -10,19 +10,21 @@ from trl_suite.motion.readers import (
     read_terrainrl,
     write_terrainrl,
 )
-from trl_suite.motion.steps import Steps
+from trl_suite.motion.steps import FootstepLibrary
 from trl_suite.motion.steps import features as step_features
 from trl_suite.motion.steps import load as load_steps
 from trl_suite.motion.steps import names as steps_names
+
+Steps = FootstepLibrary  # as programs of users may call it
 
 __all__ = [
     'DOG3D',
     'HUMANOID3D',
     'Capture',
     'Clip',
+    'FootstepLibrary',
     'Layout',
     'Mirror',
-    'Steps',
     'load',
     'load_steps',
     'names',

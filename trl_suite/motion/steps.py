@@ -47,7 +47,7 @@ _FIELDS: dict[str, tuple[str, int] | None] = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Steps:
+class FootstepLibrary:
     """A library of k steps of one character; frames, angles and columns as in `Clip`, root free.
 
     Attributes:
@@ -206,7 +206,7 @@ def features(
     return seen * np.where(side, 1, _REFLECTED)
 
 
-def load(path_or_name: str | os.PathLike[str]) -> Steps:
+def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
     """Returns a shipped library by its character's name, or a saved one by its path.
 
     Args:
@@ -220,7 +220,7 @@ def load(path_or_name: str | os.PathLike[str]) -> Steps:
     path = shipped(path_or_name, 'step library', names(), STEPS_SUFFIX)
     fields = archive.read(path, 'step library', _FIELDS)
     try:
-        return Steps(name=path.stem.removesuffix(STEPS_SUFFIX), **fields)
+        return FootstepLibrary(name=path.stem.removesuffix(STEPS_SUFFIX), **fields)
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
 

@@ -144,10 +144,10 @@ def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators) -> Parts
 def _motion(spec: EnvSpec, kind: type) -> Any:
     """Returns the clip or the library of steps of an environment."""
     given = spec.part('clip')
-    if kind is motion.Steps:
+    if kind is motion.FootstepLibrary:
         if isinstance(given, motion.Clip):
             raise ValueError(f'{given.name!r} is a clip; for footsteps, give a library of steps')
-        return given if isinstance(given, motion.Steps) else motion.load_steps(given)
-    if isinstance(given, motion.Steps):
+        return given if isinstance(given, motion.FootstepLibrary) else motion.load_steps(given)
+    if isinstance(given, motion.FootstepLibrary):
         raise ValueError(f'{given.name!r} is a library of steps; to be imitated, give a clip')
     return given if isinstance(given, motion.Clip) else motion.load(given)

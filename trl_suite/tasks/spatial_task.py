@@ -16,7 +16,7 @@ from trl_suite.engine import World
 from trl_suite.kinematics.blocks import Block, columns, layout, reflected
 from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.kinematics.spatial_reference import mean_targets
-from trl_suite.motion import Clip, Steps
+from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.components.reflection import action_reflection
 from trl_suite.tasks.components.spatial_rules import (
@@ -113,7 +113,7 @@ class SpatialTask(Task):
         self,
         character: Character,
         arena: SpatialArena,
-        motion: Clip | Steps,
+        motion: Clip | FootstepLibrary,
         typical_poses: np.ndarray,
         config: Any,
         *,
@@ -235,7 +235,7 @@ class TrackingTask(SpatialTask):
         self,
         character: Character,
         arena: SpatialArena,
-        motion: Clip | Steps,
+        motion: Clip | FootstepLibrary,
         typical_poses: np.ndarray,
         config: SpatialConfig,
         *,
@@ -352,7 +352,7 @@ class Full(NamedTuple):
     observation: np.ndarray
 
 
-def check_motion(character: Character, motion: Clip | Steps) -> None:
+def check_motion(character: Character, motion: Clip | FootstepLibrary) -> None:
     """Checks that a motion is for this spatial character.
 
     Raises:
@@ -374,7 +374,10 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
 
 
 def position_range(
-    typical_poses: np.ndarray, motion: Clip | Steps, action_offset: str, action_scale: float | None
+    typical_poses: np.ndarray,
+    motion: Clip | FootstepLibrary,
+    action_offset: str,
+    action_scale: float | None,
 ) -> dict[str, Any]:
     """Returns the arguments of position control for an action_offset and an action_scale."""
     if action_offset == 'original':

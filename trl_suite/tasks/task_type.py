@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from trl_suite.characters import Character
-from trl_suite.motion import Clip, Steps
+from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.components import description
 from trl_suite.tasks.components.differences import Difference
 from trl_suite.tasks.task import Task
@@ -38,7 +38,7 @@ class Parts(NamedTuple):
 
     character: Character
     arena: Any  # PlanarArena or SpatialArena
-    motion: Any  # Clip or Steps
+    motion: Any  # Clip or FootstepLibrary
     actuation: str
 
 
@@ -74,7 +74,7 @@ class TaskType:
       config: class of its options.
       make: parts, config -> task.
       description: functions that describe it.
-      motion: type of the reference motion: `Clip`, `Steps`, or None.
+      motion: type of the reference motion: `Clip`, `FootstepLibrary`, or None.
       actuations: supported actuation models; None for all of them.
       options: options for `suite.build` that differ from the defaults.
       score: the main performance measure, a key of the result of `evaluation.evaluate`.
@@ -88,7 +88,7 @@ class TaskType:
     config: type[Config]
     make: Callable[[Parts, Any], Task]
     description: Description
-    motion: type[Clip] | type[Steps] | None = None
+    motion: type[Clip] | type[FootstepLibrary] | None = None
     actuations: tuple[str, ...] | None = None
     options: tuple[tuple[str, Any], ...] = ()
     score: str = 'normalized_return'

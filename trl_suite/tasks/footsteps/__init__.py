@@ -1,6 +1,6 @@
 """Tasks that walk along planned footsteps."""
 
-from trl_suite.motion import Clip, Steps
+from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.components import differences
 from trl_suite.tasks.components.differences import Difference
 from trl_suite.tasks.footsteps import description
@@ -30,7 +30,7 @@ TYPES = (
         config=SpatialFootstepsConfig,
         make=tracking(SpatialFootsteps),
         description=description.SPATIAL,
-        motion=Steps,
+        motion=FootstepLibrary,
         differences=(
             differences.FROM_1200, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,
             differences.CONES,

@@ -17,7 +17,7 @@ from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement
 from trl_suite.kinematics.spatial_reference import SpatialReference
-from trl_suite.motion import Steps, quaternion, step_features
+from trl_suite.motion import FootstepLibrary, quaternion, step_features
 from trl_suite.tasks.components.comparison import comparison
 from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.components.footstep_plan import (
@@ -99,7 +99,7 @@ class SpatialFootsteps(TrackingTask):
         self,
         character: Character,
         arena: SpatialArena,
-        steps: Steps,
+        steps: FootstepLibrary,
         config: SpatialFootstepsConfig = SpatialFootstepsConfig(),
         *,
         actuation_model: str = 'position',

@@ -3,7 +3,7 @@
 from typing import Any
 
 from trl_suite import motion
-from trl_suite.motion import Clip, Steps
+from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.components import differences
 from trl_suite.tasks.components.ball import Ball
 from trl_suite.tasks.components.differences import Difference
@@ -63,7 +63,7 @@ TYPES = (
         config=HierarchicalConfig,
         make=lambda parts, config: HierarchicalNavigation(parts.character, parts.arena, parts.motion, config),
         description=description.HIERARCHICAL,
-        motion=Steps,
+        motion=FootstepLibrary,
         actuations=('position',),
         samples='plans',
         differences=(
@@ -80,7 +80,7 @@ TYPES = (
             parts.character, parts.arena, parts.motion, config, Ball(parts.arena)
         ),
         description=description.HIERARCHICAL,
-        motion=Steps,
+        motion=FootstepLibrary,
         actuations=('position',),
         samples='plans',
         differences=(

@@ -18,7 +18,7 @@ from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_reference import SpatialReference, moment
-from trl_suite.motion import Clip, Steps
+from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.components.ball import (
     BALL,
     BALL_GOAL,
@@ -398,7 +398,7 @@ class DirectNavigation(TrackingTask):
 def hidden_plan(
     character: Character,
     arena: SpatialArena,
-    steps: Steps,
+    steps: FootstepLibrary,
     config: DirectConfig,
     actuation_model: str,
 ) -> SpatialFootsteps:

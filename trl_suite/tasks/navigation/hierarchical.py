@@ -18,7 +18,7 @@ from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import Block, columns, layout
 from trl_suite.kinematics.spatial_figure import body_blocks
-from trl_suite.motion import Steps
+from trl_suite.motion import FootstepLibrary
 from trl_suite.tasks.components.ball import (
     AT_GOAL,
     BALL,
@@ -162,7 +162,7 @@ class HierarchicalNavigation(SpatialTask):
         self,
         character: Character,
         arena: SpatialArena,
-        steps: Steps,
+        steps: FootstepLibrary,
         config: HierarchicalConfig = HierarchicalConfig(),
         ball: Ball | None = None,
     ) -> None:
