@@ -121,13 +121,11 @@ class Environment(composer.Environment):
         self._hooked = True
 
     def _make_observation_updater(self) -> composer_observation.Updater:
-        # One substep: the updater must count a control step as a single update.
-        self._extra_observables = [
-            name
-            for name, item in self._task.observables.items()
-            if item.enabled and name not in self._task.blocks
-        ]
-        return composer_observation.Updater(self._task.observables, 1, True, False)
+        # Of a user's own observables; with one substep, it counts a control step as a single update.
+        blocks, known = self._task.blocks, self._task.observables
+        own = {name: item for name, item in known.items() if item.enabled and name not in blocks}
+        self._has_own_observables = bool(own)
+        return composer_observation.Updater(own, 1, True, False)
 
     def reset(self) -> dm_env.TimeStep:
         """Begins an episode; returns its first time step.
@@ -140,7 +138,7 @@ class Environment(composer.Environment):
             self.at_limit = False
             self._show_reward(0.0)
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-            if self._extra_observables:
+            if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
             return dm_env.restart(self._observe())
 
@@ -161,7 +159,7 @@ class Environment(composer.Environment):
     def _advance(self, core: Core, action: np.ndarray) -> dm_env.TimeStep:
         """Takes one action within an episode."""
         task, physics = core.task, self._physics_proxy
-        if self._extra_observables:
+        if self._has_own_observables:
             self._observation_updater.prepare_for_next_control_step()
         if self._hooked:
             self._hooks.before_step(physics, action, self._random_state)
@@ -170,7 +168,7 @@ class Environment(composer.Environment):
         else:
             task.advance(action[None], core.world.all_ids)
         self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
-        if self._extra_observables:
+        if self._has_own_observables:
             self._observation_updater.update()
         reward, failed = float(task.seen.reward[0]), bool(task.seen.failed[0])
         self._show_reward(reward)
@@ -221,9 +219,9 @@ class Environment(composer.Environment):
         row, found = self._task.observation[0].copy(), {}
         if not self._flat_observation:
             found = {name: row[part] for name, part in self.blocks.items()}
-        if self._extra_observables:
-            updated = self._observation_updater.get_observation()
-            found |= {name: np.asarray(updated[name], float) for name in self._extra_observables}
+        if self._has_own_observables:
+            own = self._observation_updater.get_observation()
+            found |= {name: np.asarray(value, float) for name, value in own.items()}
         if self._flat_observation:
             parts = [row, *(value.ravel() for value in found.values())]
             return {FLAT_OBSERVATION_KEY: np.concatenate(parts)}
@@ -257,7 +255,7 @@ class Environment(composer.Environment):
         """
         with self.core as core:
             core.set_state(state)
-            if self._extra_observables:
+            if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
 
     def __reduce__(self) -> tuple[Any, ...]:
