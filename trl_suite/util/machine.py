@@ -71,5 +71,5 @@ def sentence() -> str:
     found = ', '.join(f'{package} {version(package)}' for package in PACKAGES)
     return (
         f'{processor()}, {cores()} of {os.cpu_count()} cores usable, {platform.system()} '
-        f'{platform.machine()}, Python {platform.python_version()}, {found}'
+        f'{cpu_class()}, Python {platform.python_version()}, {found}'
     )
