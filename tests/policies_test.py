@@ -601,7 +601,7 @@ class FileTest(FolderTest):
         self.assertRegex(files.__doc__, r'\n    grid\b')
         with np.load(self.folder / 'p.npz') as data:
             np.savez(self.folder / 'p.npz', **{**data, 'grid': np.array([7, 6])})
-        with self.assertRaisesRegex(ValueError, "'line': grid: .* does not divide"):
+        with self.assertRaisesRegex(ValueError, 'p.npz: grid: .* does not divide'):
             policies.load(self.folder / 'p.npz')
 
     @parameterized.parameters(
@@ -610,7 +610,7 @@ class FileTest(FolderTest):
         ({'strides': np.array([2])}, "'filter_1': is unknown"),
         ({'filter_bias_1': None}, "'filter_bias_1': is missing"),
         ({'filter_0': np.zeros((3, 4))}, "'filter_0': has type float64 and 2 axes"),
-        ({'line': 2}, "'line': filter_0: 4 of width 3"),
+        ({'line': 2}, 'filter_0: 4 of width 3'),
         ({'origin': 0.5}, "'origin': has type float64"),
         ({'origin': 40}, 'origin: is 40; expected'),
         ({'layer_norm': 2}, "'layer_norm': is 2; expected 1"),
@@ -724,7 +724,7 @@ class FileTest(FolderTest):
         ({'weight_0': np.zeros((8, 6))}, r'weight_0: has shape \(8, 6\); expected \(7, 6\)'),
         ({'weight_2': np.zeros((5, 3))}, r'weight_2: has shape \(5, 3\); expected \(5, 2\)'),
         ({'bias_0': np.zeros(5)}, r'bias_0: has shape \(5,\); expected \(6,\)'),
-        ({'weight_0': np.zeros((2, 7, 6))}, r"'bias_0': has type float\d+ and 1 axes"),
+        ({'weight_0': np.zeros((2, 7, 6))}, r"'weight_1': has type float\d+ and 2 axes"),
         ({'weight_0': np.zeros(7)}, "'weight_0': has type float64 and 1 axes"),
         ({'weight_0': np.zeros((7, 6), int)}, "'weight_0': has type int64 and 2 axes"),
         ({'block_sizes': np.array([3, 5])}, r'mean: has shape \(7,\); expected \(8,\)'),

@@ -184,63 +184,81 @@ def load(path: str | os.PathLike[str]) -> Policy:
       ValueError: a broken or malformed file; the message names file and field.
       FileNotFoundError: there is no such file.
     """
-    path = existing(path, ('.npz',))
-    fields: dict[str, Any] = {}
-    read = _Reader()
+    path, field = existing(path, ('.npz',)), ''
+    arrays: dict[str, np.ndarray] = {}
     try:
         archive = load_arrays(path)
-        read.archive = archive
-        for name, (kind, axes) in _FIELDS.items():
-            fields[name] = read(name, kind, axes).tolist()
-            if name == 'format' and fields[name] != FORMAT:
-                raise ValueError(f'is {fields[name]!r}; expected {FORMAT!r}')
-            if name == 'version' and fields[name] != VERSION:
-                raise ValueError(f'is {fields[name]}; expected {VERSION}')
-        read.field = 'weight_0'
-        read.stacked = int('weight_0' in archive and archive['weight_0'].ndim == 3)
-        weights, biases = read.layers('', fields['layers'], 2)
-        if any(name.startswith('mirror_') for name in archive.files):
-            side = 'feet' if 'mirror_feet' in archive else 'phase'
-            parts: dict[str, Any] = {}
-            for name, (kind, axes) in {**_MIRROR, side: _SIDES[side]}.items():
-                parts[name] = read(f'mirror_{name}', kind, axes)
-            fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
-        if any(name in archive for name in _LINE):
-            line = {name: read(name, *_LINE[name]).tolist() for name in _LINE}
-            for name in [name for name in _LINE_OPTIONAL if name in archive]:
-                line[name] = read(name, *_LINE_OPTIONAL[name]).tolist()
-            filters = read.layers('filter', len(line['strides']), 4 if 'grid' in line else 3)
-            read.field = 'line'
-            fields['convolution'] = Convolution(weights=filters[0], biases=filters[1], **line)
-        if 'layer_norm' in archive:
-            fields['layer_norm'] = read('layer_norm', 'iu', 0).tolist()
-            if fields['layer_norm'] != 1:
-                raise ValueError(f'is {fields["layer_norm"]}; expected 1')
-        for name in _OPTIONAL.keys() & archive.files:
-            fields[name] = read(name, *_OPTIONAL[name])
-        read.field = 'info'
-        fields['info'] = json.loads(fields['info'])
-        for left in sorted({*archive.files} - read.taken):
-            read.field = left
-            if left.partition('_')[0] not in ('weight', 'bias'):
-                raise ValueError('is unknown')
-            read.field = 'layers'
-            raise ValueError(f'is {len(weights)}, but there are arrays of other layers')
+        for field in archive.files:
+            arrays[field] = archive[field]
     except Exception as error:  # damaged archives raise many types of errors
-        where = f'field {read.field!r}' if read.field else 'no readable policy'
+        where = f'field {field!r}' if field else 'no readable policy'
         raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
-    names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
-    for name in ('format', 'version', 'layers'):
-        del fields[name]
     try:
-        return Policy(
-            blocks=tuple(zip(names, sizes, strict=True)),
-            weights=weights,
-            biases=biases,
-            **fields,
-        )
-    except ValueError as error:
+        return _policy(arrays)
+    except Exception as error:  # wrong numbers do, too
         raise ValueError(f'{path}: {error}') from None
+
+
+def _policy(arrays: dict[str, np.ndarray]) -> Policy:
+    """Makes a policy of the arrays of a file, which it takes from the dict."""
+    fields: dict[str, Any] = {}
+    for name, form in _FIELDS.items():
+        fields[name] = _take(arrays, name, *form).tolist()
+        expected = {'format': FORMAT, 'version': VERSION}.get(name, fields[name])
+        if fields[name] != expected:
+            raise ValueError(f'field {name!r}: is {fields[name]!r}; expected {expected!r}')
+    stacked = int('weight_0' in arrays and arrays['weight_0'].ndim == 3)  # axes of an ensemble
+    layers = fields.pop('layers')
+    fields['weights'] = _layers(arrays, 'weight', layers, stacked + 2)
+    fields['biases'] = _layers(arrays, 'bias', layers, stacked + 1)
+    if any(name.startswith('mirror_') for name in arrays):
+        side = 'feet' if 'mirror_feet' in arrays else 'phase'
+        forms = {**_MIRROR, side: _SIDES[side]}
+        parts: dict[str, Any] = {
+            name: _take(arrays, f'mirror_{name}', *form) for name, form in forms.items()
+        }
+        fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
+    if any(name in arrays for name in _LINE):
+        forms = _LINE | {name: form for name, form in _LINE_OPTIONAL.items() if name in arrays}
+        line = {name: _take(arrays, name, *form).tolist() for name, form in forms.items()}
+        count, axes = len(line['strides']), stacked + (4 if 'grid' in line else 3)
+        line['weights'] = _layers(arrays, 'filter', count, axes)
+        line['biases'] = _layers(arrays, 'filter_bias', count, stacked + 1)
+        fields['convolution'] = Convolution(**line)
+    if 'layer_norm' in arrays:
+        fields['layer_norm'] = _take(arrays, 'layer_norm', 'iu', 0).tolist()
+        if fields['layer_norm'] != 1:
+            raise ValueError(f"field 'layer_norm': is {fields['layer_norm']}; expected 1")
+    for name in _OPTIONAL.keys() & arrays.keys():
+        fields[name] = _take(arrays, name, *_OPTIONAL[name])
+    try:
+        fields['info'] = json.loads(fields['info'])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"field 'info': {error}") from None
+    for name in sorted(arrays):
+        if name.partition('_')[0] not in ('weight', 'bias'):
+            raise ValueError(f'field {name!r}: is unknown')
+        found = len(fields['weights'])
+        raise ValueError(f"field 'layers': is {found}, but there are arrays of other layers")
+    del fields['format'], fields['version']
+    blocks = zip(fields.pop('block_names'), fields.pop('block_sizes'), strict=True)
+    return Policy(blocks=tuple(blocks), **fields)
+
+
+def _take(arrays: dict[str, np.ndarray], name: str, kinds: str, axes: int) -> np.ndarray:
+    """Takes an array of one of the kinds of dtypes, and with so many axes."""
+    if name not in arrays:
+        raise ValueError(f'field {name!r}: is missing')
+    array = arrays.pop(name)
+    if array.dtype.kind not in kinds or array.ndim != axes:
+        raise ValueError(f'field {name!r}: has type {array.dtype} and {array.ndim} axes')
+    return array
+
+
+def _layers(
+    arrays: dict[str, np.ndarray], name: str, count: int, axes: int
+) -> tuple[np.ndarray, ...]:
+    return tuple(_take(arrays, f'{name}_{i}', 'f', axes) for i in range(count))
 
 
 def reference(id: str, variant: str = '') -> Policy:
@@ -332,35 +350,3 @@ def _small(value: Any) -> Any:
     with np.errstate(over='ignore'):
         half = value.astype(np.float16)
     return half if np.array_equal(half, value) else value
-
-
-class _Reader:
-    """Reads arrays from an archive; remembers the last field and all fields that were read."""
-
-    def __init__(self) -> None:
-        self.archive: Any = {}
-        self.field = ''
-        self.taken: set[str] = set()
-        self.stacked = 0  # number of axes before those of a layer: 1 for an ensemble
-
-    def __call__(self, field: str, kind: str, axes: int) -> np.ndarray:
-        self.field = field
-        self.taken.add(field)
-        if field not in self.archive:
-            raise ValueError('is missing')
-        array = self.archive[field]
-        if array.dtype.kind not in kind or array.ndim != axes:
-            raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
-        return array
-
-    def layers(self, kind: str, count: int, axes: int) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Returns weights and biases of `count` layers of one kind."""
-        weight, bias = (kind, f'{kind}_bias') if kind else ('weight', 'bias')
-        found = [
-            (
-                self(f'{weight}_{i}', 'f', self.stacked + axes),
-                self(f'{bias}_{i}', 'f', self.stacked + 1),
-            )
-            for i in range(count)
-        ]
-        return tuple(part[0] for part in found), tuple(part[1] for part in found)
