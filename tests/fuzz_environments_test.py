@@ -5,6 +5,7 @@ draw the same; the slow ones (`-m slow`) draw a seed, print it, and take it from
 FUZZ_EXAMPLES says how many.
 """
 
+import dataclasses
 import functools
 import os
 import pickle
@@ -125,7 +126,7 @@ def check_option(task_type, name, value, step):
 
 
 def option_test(task_type, step):
-    names = [option.name for option in TASK_TYPES[task_type].config.options()]
+    names = [option.name for option in dataclasses.fields(TASK_TYPES[task_type].config)]
 
     @hypothesis.given(st.sampled_from(names), anything)
     def test(name, value):
@@ -152,7 +153,7 @@ DISTURBANCES = [  # option of the task, option in it, and a function that makes 
         ('randomize', worlds.WorldConfig, _world), ('randomize', worlds.PushConfig, _push),
         ('sensors', sensors.SensorConfig, _sensor),
     )
-    for option in config.options()
+    for option in dataclasses.fields(config)
 ]  # fmt: skip
 
 

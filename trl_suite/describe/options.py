@@ -50,9 +50,9 @@ _EVERYWHERE = (
 def options(spec: EnvSpec) -> Section:
     """Returns the table of an environment's options."""
     cells: list[tuple[object, ...]] = [
-        (option.name, _shown(option.default), option.unit, option.meaning)
-        for option in sorted(task_options(spec))
-        if option.actuation in (None, spec.actuation)
+        (name, _shown(default), data['unit'], data['meaning'])
+        for name, (default, data) in sorted(task_options(spec).items())
+        if data['actuation'] in (None, spec.actuation)
     ]
     cells += _EVERYWHERE
     cells.append(('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'))

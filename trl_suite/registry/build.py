@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +18,7 @@ from trl_suite.tasks import variation
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
 from trl_suite.util import errors, notices
-from trl_suite.util.options import Config, Option
+from trl_suite.util.options import Config, option
 
 DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
@@ -45,20 +46,23 @@ def config_of(spec: EnvSpec) -> type[Config] | None:
     return config[character_of(spec).spatial] if isinstance(config, Mapping) else config
 
 
-def task_options(spec: EnvSpec) -> list[Option]:
-    """Returns the options of an environment's task, except those that all tasks have."""
+def task_options(spec: EnvSpec) -> dict[str, tuple[Any, Mapping[str, Any]]]:
+    """Returns default and metadata (see `option`) of the options of an environment's task, by name.
+
+    Those that all tasks have are not among them.
+    """
     config = config_of(spec)
     if config is None:
-        known = [
-            Option(name, parameter.default, '')
+        known = {
+            name: (parameter.default, option(None, '').metadata)
             for name, parameter in inspect.signature(spec.own['task_type']).parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
-        ]
+        }
     else:
-        known = config.options()
-    return [
-        option._replace(default=spec.options.get(option.name, option.default)) for option in known
-    ]
+        known = {each.name: (each.default, each.metadata) for each in dataclasses.fields(config)}
+    return {
+        name: (spec.options.get(name, default), data) for name, (default, data) in known.items()
+    }
 
 
 def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
@@ -82,17 +86,13 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     type_, others = task_type(spec), (*variation.OPTIONS, 'random')
     config_type, config = config_of(spec), None
     if config_type is None:
-        known = {option.name for option in task_options(spec)}
-        for name in merged:
-            if name not in known:
-                choices = [*known, *others]
-                raise ValueError(errors.unknown(f'option of {spec.id}', name, choices))
+        known = task_options(spec)
+        if not known.keys() >= merged.keys():
+            errors.check_known(f'option of {spec.id}', [*known, *others], *merged)
     else:
-        policies_ = {
-            option.name: option.default for option in config_type.options() if option.policy
-        }
-        for name, default in policies_.items():
-            merged[name] = _policy(name, merged.get(name, default))
+        for each in dataclasses.fields(config_type):
+            if each.metadata['policy']:
+                merged[each.name] = _policy(each.name, merged.get(each.name, each.default))
         config = config_type.parse(spec.id, merged, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(

@@ -7,7 +7,7 @@
 
     HopConfig(height=0.5).height  # Range(0.5, 0.5); height=(0.2, 0.5) is drawn between them
     HopConfig.parse('my environment', {'heigth': 0.5})  # ValueError; did you mean 'height'?
-    HopConfig.options()  # name, default, unit and meaning of each, for pages
+    dataclasses.fields(HopConfig)  # name and default of each; `metadata` has meaning, unit and bounds
 
 Constructors, `trl-suite info`, documentation pages and error messages read the same fields.
 `checked` applies the same rules to the arguments of functions.
@@ -77,17 +77,6 @@ def option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-class Option(NamedTuple):
-    """Name and properties of an option; see `option`."""
-
-    name: str
-    default: Any
-    meaning: str
-    unit: str = ''
-    actuation: str | None = None
-    policy: bool = False
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
     """Base class of options; a subclass has a field, made by `option`, for each of them.
@@ -141,17 +130,6 @@ class Config:
             errors.check_known(f'option of {owner}', [*known, *others], *given)
         preset = given.get('preset')
         return cls(**{**(cls.presets.get(preset, {}) if isinstance(preset, str) else {}), **given})
-
-    @classmethod
-    def options(cls) -> list[Option]:
-        """Returns all options of the class."""
-        return [
-            Option(
-                field.name, field.default,
-                *(field.metadata[key] for key in ('meaning', 'unit', 'actuation', 'policy')),
-            )
-            for field in dataclasses.fields(cls)
-        ]  # fmt: skip
 
     @property
     def changed(self) -> dict[str, Any]:
