@@ -782,7 +782,7 @@ class ConstructionTest(parameterized.TestCase):
         ({'step_limit': 0}, 'step_limit is 0'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
         ({'time_limit': 0}, 'time_limit is 0'), ({'time_limit': np.nan}, 'time_limit is nan'),
         ({'random': -1}, 'random is -1'), ({'random': 2**32}, 'random is 4294967296'),
-        *(({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
+        *(({'step_limit': value}, 'step_limit is .*; expected None or a whole number at least 1')
           for value in (np.inf, np.nan, 'abc', True, [2], np.arange(2), -1)),
         *(({'time_limit': value}, 'time_limit is .*; expected a positive number of seconds')
           for value in (None, 'abc', True, [2], np.arange(2), -1)),

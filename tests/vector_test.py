@@ -190,7 +190,7 @@ class LimitTest(parameterized.TestCase):
     @parameterized.parameters(
         ({'time_limit': 0}, 'time_limit is 0; expected a positive number of seconds'),
         ({'time_limit': float('nan')}, 'time_limit is nan'),
-        ({'step_limit': 0}, 'step_limit is 0; expected a positive integer or None'),
+        ({'step_limit': 0}, 'step_limit is 0; expected None or a whole number at least 1'),
         ({'step_limit': -1}, 'step_limit is -1'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
         ({'random': 3}, "'random'.*`seed`"), ({'time_limt': 3}, 'time_limt'),
     )  # fmt: skip
@@ -495,7 +495,7 @@ class RobustnessTest(parameterized.TestCase):
             for value in ('abc', None, np.inf, 1.5, 2**40)
         ),
         *(
-            ({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
+            ({'step_limit': value}, 'step_limit is .*; expected None or a whole number at least 1')
             for value in ('abc', np.inf, [1, 2], -2)
         ),
         ({'seed': -1}, 'seed is -1; expected 0 or a positive integer'),

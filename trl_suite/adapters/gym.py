@@ -30,6 +30,7 @@ from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 try:
     import gymnasium
@@ -267,7 +268,7 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
     options = errors.options('task_kwargs', task_kwargs)
     if max_episode_steps == -1:
         return {'step_limit': None, **options}
-    limit = arguments.check_step_limit(max_episode_steps, 'max_episode_steps', '-1 for no limit')
+    limit = checked('max_episode_steps', max_episode_steps, int | None, at_least=1)
     if limit is not None:
         own = options.get('step_limit')
         options['step_limit'] = limit if own is None else min(own, limit)

@@ -22,24 +22,6 @@ def absolute(value: Any) -> Any:
     return value
 
 
-def check_step_limit(value: Any, name: str = 'step_limit', none: str = 'None') -> int | None:
-    """Returns a limit of control steps; None for no limit.
-
-    Args:
-      value: the limit.
-      name: name of the argument.
-      none: what stands for no limit, for the message.
-
-    Raises:
-      ValueError: it is neither None nor a positive integer.
-    """
-    if value is None:
-        return None
-    if not (errors.is_number(value) and 1 <= value < np.inf and value % 1 == 0):
-        raise ValueError(f'{name} is {value!r}; expected a positive integer or {none}')
-    return int(value)
-
-
 def check_time_limit(value: Any) -> float:
     """Returns a limit of simulated time in s; infinity for no limit.
 

@@ -75,7 +75,7 @@ class Environment(composer.Environment):
             `visualize_reward` that is no bool, or substep hooks.
           TypeError: a seed that is not an integer.
         """
-        self.step_limit = arguments.check_step_limit(step_limit)
+        self.step_limit = checked('step_limit', step_limit, int | None, at_least=1)
         if isinstance(random, (int, float, str, bytes, np.random.Generator)):
             arguments.check_seed('random', random)
         checked('flat_observation', flat_observation, bool)

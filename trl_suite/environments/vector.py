@@ -120,7 +120,8 @@ class VectorEnvironment:
             raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
         if isinstance(step_limit, int) and step_limit == -1:
             step_limit = self.spec.step_limit
-        self.step_limit = arguments.check_step_limit(options.pop('step_limit', step_limit))
+        step_limit = options.pop('step_limit', step_limit)
+        self.step_limit = checked('step_limit', step_limit, int | None, at_least=1)
         self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
         task = build_task(self.spec, options)
         model = light_model(task.root_entity.mjcf_model)
