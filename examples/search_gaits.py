@@ -296,8 +296,9 @@ def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarr
     record = files.read_json(folder / 'curve.json')
     if record['settings'] != json.loads(json.dumps(dataclasses.asdict(settings))):
         raise ValueError(f'{folder} holds a run with other settings: {record["settings"]}')
-    found = archive.read(path, 'decisions', {'observation': None, 'worth': None})
-    return found['observation'], found['worth'], record['curve']
+    found = archive.arrays(path, 'decisions')
+    observation, worth = (archive.take(found, name, 'f', 2) for name in ('observation', 'worth'))
+    return observation, worth, record['curve']
 
 
 def main() -> None:

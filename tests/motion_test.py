@@ -419,11 +419,11 @@ class FileTest(parameterized.TestCase):
         ('first_missing', 'times', None, "'times': is missing"),
         ('missing', 'loop', None, "'loop': is missing"),
         ('objects', 'joints', np.array(['a', 1], dtype=object), "'joints'"),
-        ('kind', 'loop', np.array('yes'), "'loop' has type"),
-        ('axes', 'root', np.array(['planar']), "'root' has type"),
-        ('sizes', 'sizes', np.array([1.0, 1.0]), "'sizes' has type"),
+        ('kind', 'loop', np.array('yes'), "'loop': has type"),
+        ('axes', 'root', np.array(['planar']), "'root': has type"),
+        ('sizes', 'sizes', np.array([1.0, 1.0]), "'sizes': has type"),
         ('content', 'times', np.arange(9.0) + 1, 'times: must start at 0'),
-        ('numbers', 'poses', np.array(['a', 'b']), 'poses: expected an array of numbers'),
+        ('numbers', 'poses', np.array(['a', 'b']), "'poses': has type <U1 and 1 axes"),
     )
     def test_malformed_field(self, field, value, message):
         path = self.folder / 'bad.npz'
@@ -683,7 +683,9 @@ class ReaderTest(parameterized.TestCase):
         self.assertFalse(self.deepmimic(Loop='wrap').turning)
         self.assertTrue(self.deepmimic(Loop='wrap', CycleSyncRootRot=True).turning)
         self.assertFalse(self.deepmimic(Loop='none', CycleSyncRootRot=True).turning)
-        with self.assertRaisesRegex(ValueError, 'walk.txt: CycleSyncRootRot: true or false'):
+        with self.assertRaisesRegex(
+            ValueError, 'walk.txt: CycleSyncRootRot is 1; expected True or False'
+        ):
             self.deepmimic(Loop='wrap', CycleSyncRootRot=1)
 
     def test_deepmimic_rejects_other_cycles(self):
@@ -693,13 +695,13 @@ class ReaderTest(parameterized.TestCase):
         self.deepmimic(Loop='none', CycleSyncRootPos=False)
 
     @parameterized.parameters(
-        (motion.read_deepmimic, True, "'wrap' or 'none'"),
-        (motion.read_terrainrl, 'wrap', 'true or false'),
+        (motion.read_deepmimic, True, "True; expected 'wrap' or 'none'"),
+        (motion.read_terrainrl, 'wrap', "'wrap'; expected True or False"),
     )
     def test_loop_of_the_other_dialect(self, read, loop, message):
         self.write([[0.1, 0, 0, 0, 1, 0, 0, 0]] * 2, Loop=loop)
         more = ('free',) if read is motion.read_terrainrl else ()
-        with self.assertRaisesRegex(ValueError, f'walk.txt: Loop: {message}'):
+        with self.assertRaisesRegex(ValueError, f'walk.txt: Loop is {message}'):
             read(self.path, (), (), *more)
 
     GOOD = (0.1, 0, 1, 0, 1, 0, 0, 0, 0.2)

@@ -13,6 +13,7 @@ import functools
 import os
 import pathlib
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,10 +26,10 @@ VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
 STEPS_SUFFIX = '_steps'  # suffix of files that contain a step library instead of a clip
 _UNIT_TOLERANCE = 1e-6
 _STRAIGHT = 1e-9  # rad; a cycle with a smaller heading change is straight
-_FIELDS: dict[str, tuple[str, int] | None] = {
-    'times': None,
-    'poses': None,
+_FIELDS = {  # kinds of their dtypes, and numbers of axes
     'root': ('U', 0),
+    'times': ('fiu', 1),
+    'poses': ('fiu', 2),
     'joints': ('U', 1),
     'sizes': ('iu', 1),
     'loop': ('b', 0),
@@ -70,6 +71,8 @@ class Clip:
 
     def __post_init__(self) -> None:
         put, what = functools.partial(object.__setattr__, self), f'clip {self.name!r}'
+        put('root', str(self.root))
+        put('description', str(self.description))
         put('joints', tuple(map(str, self.joints)))
         put('sizes', tuple(map(int, self.sizes)))
         put('loop', bool(self.loop))
@@ -240,9 +243,13 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
       FileNotFoundError: if there is no file at the path.
     """
     path = shipped(path_or_name, 'clip', names())
-    fields = archive.read(path, 'clip', _FIELDS, {'turning': False})
+    arrays = archive.arrays(path, 'clip')
+    arrays.setdefault('turning', np.array(False))
     try:
-        return Clip(name=path.stem, **fields)
+        fields: dict[str, Any] = {
+            name: archive.take(arrays, name, *form) for name, form in _FIELDS.items()
+        }
+        return Clip(path.stem, **fields)
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
 

@@ -26,6 +26,7 @@ import numpy as np
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
 from trl_suite.util.files import read_json, replacing
+from trl_suite.util.options import checked
 
 # Numbers of a frame before the joints, and those of DeepTerrainRL.
 _ROOT: tuple[str, ...] = ('duration', *3 * ('root position',), *4 * ('root quaternion',))
@@ -83,9 +84,7 @@ def read_terrainrl(
         motion, head = motion['Motion'], _PLANAR_ROOT
         if root != 'planar':
             raise ValueError(f'{path}: a motion in the plane; expected a planar character')
-    loop = motion.get('Loop', False)
-    if not isinstance(loop, bool):
-        raise ValueError(f'{path}: Loop: true or false is needed, found {loop!r}')
+    loop = checked(f'{path}: Loop', motion.get('Loop', False), bool)
     frames = _frames(path, motion, head)
     if head is _PLANAR_ROOT:
         duration, x, y, angle = frames[:, : len(head)].T
@@ -126,11 +125,9 @@ def read_deepmimic(
     motion = _parse(path)
     loop = motion.get('Loop', 'none')
     if loop not in ('wrap', 'none'):
-        raise ValueError(f"{path}: Loop: 'wrap' or 'none' is needed, found {loop!r}")
+        raise ValueError(f"{path}: Loop is {loop!r}; expected 'wrap' or 'none'")
     looping = loop == 'wrap'
-    turning = motion.get('CycleSyncRootRot', False)
-    if not isinstance(turning, bool):
-        raise ValueError(f'{path}: CycleSyncRootRot: true or false is needed, found {turning!r}')
+    turning = checked(f'{path}: CycleSyncRootRot', motion.get('CycleSyncRootRot', False), bool)
     frames = _frames(path, motion)
     if joints is None or sizes is None:
         layout = _deepmimic_layout(path, frames.shape[1])

@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,14 +35,14 @@ FEATURES = (
 )  # m, m, m, m, m, m, rad; for a walker in right stance
 WEIGHTS = (0.0, 0.0, 0.0, 0.0, 0.54, 0.54, 0.48)  # of the features, 1/m and 1/rad
 _REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # signs of features in left stance
-_FIELDS: dict[str, tuple[str, int] | None] = {
-    'times': None,
-    'poses': None,
+_FIELDS = {  # kinds of their dtypes, and numbers of axes
+    'labels': ('fiu', 2),
+    'times': ('fiu', 1),
+    'poses': ('fiu', 3),
     'joints': ('U', 1),
     'sizes': ('iu', 1),
-    'labels': None,
-    'previous': None,
-    'features': None,
+    'previous': ('fiu', 2),
+    'features': ('fiu', 2),
     'description': ('U', 0),
 }
 
@@ -80,6 +81,7 @@ class FootstepLibrary:
 
     def __post_init__(self) -> None:
         put, what = functools.partial(object.__setattr__, self), f'steps {self.name!r}'
+        put('description', str(self.description))
         put('joints', tuple(map(str, self.joints)))
         put('sizes', tuple(map(int, self.sizes)))
         put('times', errors.floats(f'{what}, times', self.times))
@@ -218,9 +220,12 @@ def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
       FileNotFoundError: if there is no file at the path.
     """
     path = shipped(path_or_name, 'step library', names(), STEPS_SUFFIX)
-    fields = archive.read(path, 'step library', _FIELDS)
+    arrays = archive.arrays(path, 'step library')
     try:
-        return FootstepLibrary(name=path.stem.removesuffix(STEPS_SUFFIX), **fields)
+        fields: dict[str, Any] = {
+            name: archive.take(arrays, name, *form) for name, form in _FIELDS.items()
+        }
+        return FootstepLibrary(path.stem.removesuffix(STEPS_SUFFIX), **fields)
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
 

@@ -98,8 +98,9 @@ import numpy as np
 from trl_suite.policies.convolution import Convolution
 from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Policy
-from trl_suite.util import errors, resources
-from trl_suite.util.files import check_path, existing, load_arrays, replacing
+from trl_suite.util import archive, errors, resources
+from trl_suite.util.archive import take
+from trl_suite.util.files import check_path, existing, replacing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
@@ -184,15 +185,8 @@ def load(path: str | os.PathLike[str]) -> Policy:
       ValueError: a broken or malformed file; the message names file and field.
       FileNotFoundError: there is no such file.
     """
-    path, field = existing(path, ('.npz',)), ''
-    arrays: dict[str, np.ndarray] = {}
-    try:
-        archive = load_arrays(path)
-        for field in archive.files:
-            arrays[field] = archive[field]
-    except Exception as error:  # damaged archives raise many types of errors
-        where = f'field {field!r}' if field else 'no readable policy'
-        raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
+    path = existing(path, ('.npz',))
+    arrays = archive.arrays(path, 'policy')
     try:
         return _policy(arrays)
     except Exception as error:  # wrong numbers do, too
@@ -203,7 +197,7 @@ def _policy(arrays: dict[str, np.ndarray]) -> Policy:
     """Makes a policy of the arrays of a file, which it takes from the dict."""
     fields: dict[str, Any] = {}
     for name, form in _FIELDS.items():
-        fields[name] = _take(arrays, name, *form).tolist()
+        fields[name] = take(arrays, name, *form).tolist()
         expected = {'format': FORMAT, 'version': VERSION}.get(name, fields[name])
         if fields[name] != expected:
             raise ValueError(f'field {name!r}: is {fields[name]!r}; expected {expected!r}')
@@ -215,22 +209,22 @@ def _policy(arrays: dict[str, np.ndarray]) -> Policy:
         side = 'feet' if 'mirror_feet' in arrays else 'phase'
         forms = {**_MIRROR, side: _SIDES[side]}
         parts: dict[str, Any] = {
-            name: _take(arrays, f'mirror_{name}', *form) for name, form in forms.items()
+            name: take(arrays, f'mirror_{name}', *form) for name, form in forms.items()
         }
         fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
     if any(name in arrays for name in _LINE):
         forms = _LINE | {name: form for name, form in _LINE_OPTIONAL.items() if name in arrays}
-        line = {name: _take(arrays, name, *form).tolist() for name, form in forms.items()}
+        line = {name: take(arrays, name, *form).tolist() for name, form in forms.items()}
         count, axes = len(line['strides']), stacked + (4 if 'grid' in line else 3)
         line['weights'] = _layers(arrays, 'filter', count, axes)
         line['biases'] = _layers(arrays, 'filter_bias', count, stacked + 1)
         fields['convolution'] = Convolution(**line)
     if 'layer_norm' in arrays:
-        fields['layer_norm'] = _take(arrays, 'layer_norm', 'iu', 0).tolist()
+        fields['layer_norm'] = take(arrays, 'layer_norm', 'iu', 0).tolist()
         if fields['layer_norm'] != 1:
             raise ValueError(f"field 'layer_norm': is {fields['layer_norm']}; expected 1")
     for name in _OPTIONAL.keys() & arrays.keys():
-        fields[name] = _take(arrays, name, *_OPTIONAL[name])
+        fields[name] = take(arrays, name, *_OPTIONAL[name])
     try:
         fields['info'] = json.loads(fields['info'])
     except (ValueError, RecursionError) as error:
@@ -245,20 +239,10 @@ def _policy(arrays: dict[str, np.ndarray]) -> Policy:
     return Policy(blocks=tuple(blocks), **fields)
 
 
-def _take(arrays: dict[str, np.ndarray], name: str, kinds: str, axes: int) -> np.ndarray:
-    """Takes an array of one of the kinds of dtypes, and with so many axes."""
-    if name not in arrays:
-        raise ValueError(f'field {name!r}: is missing')
-    array = arrays.pop(name)
-    if array.dtype.kind not in kinds or array.ndim != axes:
-        raise ValueError(f'field {name!r}: has type {array.dtype} and {array.ndim} axes')
-    return array
-
-
 def _layers(
     arrays: dict[str, np.ndarray], name: str, count: int, axes: int
 ) -> tuple[np.ndarray, ...]:
-    return tuple(_take(arrays, f'{name}_{i}', 'f', axes) for i in range(count))
+    return tuple(take(arrays, f'{name}_{i}', 'f', axes) for i in range(count))
 
 
 def reference(id: str, variant: str = '') -> Policy:

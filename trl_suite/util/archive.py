@@ -19,41 +19,32 @@ def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def read(
-    path: pathlib.Path,
-    what: str,
-    fields: Mapping[str, tuple[str, int] | None],
-    defaults: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Returns the fields of an archive.
+def arrays(path: pathlib.Path, what: str) -> dict[str, np.ndarray]:
+    """Returns the arrays of an archive by name; `what` is what it should contain, for messages.
 
-    Args:
-      path: file.
-      what: what the file should contain, for messages.
-      fields: names of the fields. The value of a field that becomes a Python object is the allowed
-        kinds of its dtype and its number of axes; None means an array, which the caller checks.
-      defaults: values of fields that may be missing.
+    Raises:
+      ValueError: a corrupt file; the message has the path and the field.
+      FileNotFoundError: there is no file at the path.
     """
-    found: dict[str, Any] = {}
+    found: dict[str, np.ndarray] = {}
     field = ''
     try:
         archive = load_arrays(path)
-        for field in fields:
-            if field in archive:
-                found[field] = archive[field]
-            elif not defaults or field not in defaults:
-                raise ValueError('is missing')
+        for field in archive.files:
+            found[field] = archive[field]
     except FileNotFoundError:
         raise
     except Exception as error:  # a corrupt archive raises many types of exceptions
         where = f'field {field!r}' if field else f'no readable {what}'
         raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
-    for field, value in found.items():
-        form = fields[field]
-        if form is None:
-            continue
-        kinds, axes = form
-        if value.dtype.kind not in kinds or value.ndim != axes:
-            raise ValueError(f'{path}: field {field!r} has type {value.dtype}, {value.ndim} axes')
-        found[field] = value.tolist()
-    return {**(defaults or {}), **found}
+    return found
+
+
+def take(found: dict[str, np.ndarray], name: str, kinds: str, axes: int) -> np.ndarray:
+    """Takes out an array whose dtype has one of the kinds, and which has so many axes."""
+    if name not in found:
+        raise ValueError(f'field {name!r}: is missing')
+    array = found.pop(name)
+    if array.dtype.kind not in kinds or array.ndim != axes:
+        raise ValueError(f'field {name!r}: has type {array.dtype} and {array.ndim} axes')
+    return array
