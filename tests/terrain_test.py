@@ -436,7 +436,7 @@ class FileTest(parameterized.TestCase):
         ('no_type', '{"Params": []}', ["'Type' is missing", 'var2d_gaps']),
         ('wrong_key', '{"Type": "var2d_gaps", "Parms": []}', ["'Parms'", "'Params'"]),
         ('type', '{"Type": "var2d_gap"}', ["'var2d_gap'", "'var2d_gaps'"]),
-        ('type_3d', '{"Type": ["x"]}', ['Type must be a string']),
+        ('type_3d', '{"Type": ["x"]}', ["Type is ['x']; expected a string"]),
         ('no_list', '{"Type": "var2d_gaps", "Params": {}}', ['Params must be a list']),
         ('no_set', '{"Type": "var2d_gaps", "Params": [1]}', ['Params[0]', 'must be an object']),
         ('misspelt', '{"Type": "var2d_gaps", "Params": [{}, {"GapWidthMin": 1}]}',

@@ -16,12 +16,7 @@ from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
 
 _EVERYWHERE = (
-    (
-        'rewards, observations, failures',
-        '-',
-        '',
-        'custom functions; see docs/make_your_own.md',
-    ),
+    ('rewards, observations, failures', '-', '', 'custom functions; see docs/make_your_own.md'),
     (
         'randomize',
         '-',

@@ -149,8 +149,7 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     check_known(f'key of {name}:', known, *content)
     if 'Type' not in content:
         raise ValueError(f"{name}: key 'Type' is missing; known types: {', '.join(GENERATORS)}")
-    if not isinstance(content['Type'], str):
-        raise ValueError(f'{name}: Type must be a string, not {content["Type"]!r}')
+    checked(f'{name}: Type', content['Type'], str)
     sets = content.get('Params', ())
     if not isinstance(sets, (list, tuple)):
         raise ValueError(f'{name}: Params must be a list of parameter sets, not {sets!r}')
