@@ -489,11 +489,13 @@ class VectorTest(Same, parameterized.TestCase):
     @parameterized.parameters(0, 2.5, -3, np.inf, 'abc', True)
     def test_invalid_max_episode_steps_are_rejected(self, steps):
         with self.assertRaisesRegex(
-            ValueError, f'max_episode_steps is {steps!r}; expected None or a whole number at least 1'
+            ValueError,
+            f'max_episode_steps is {steps!r}; expected None or a whole number at least 1',
         ):
             SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
         with self.assertRaisesRegex(
-            ValueError, f'max_episode_steps is {steps!r}; expected None or a whole number at least 1'
+            ValueError,
+            f'max_episode_steps is {steps!r}; expected None or a whole number at least 1',
         ):
             SuiteEnv(FLAT, max_episode_steps=steps)
         with self.assertRaisesRegex(ValueError, 'already made'):

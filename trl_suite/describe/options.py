@@ -11,46 +11,25 @@ from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
 from trl_suite.kinematics.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.variation import sensors, worlds
+from trl_suite.tasks.variation import CommonOptions, additions, sensors, worlds
 from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
-
-_EVERYWHERE = (
-    ('rewards, observations, failures', '-', '', 'custom functions; see docs/make_your_own.md'),
-    (
-        'randomize',
-        '-',
-        '',
-        "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a dict, see "
-        'docs/realism_worlds.md',
-    ),
-    (
-        'sensors',
-        '-',
-        '',
-        "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
-        'docs/realism_worlds.md',
-    ),
-    (
-        'actuators',
-        '-',
-        '',
-        'limits, delay, noise, strength, free play and elasticity of motors: a dict, see docs/realism.md',
-    ),
-    ('random', '-', '', 'seed; by default drawn from the operating system'),
-    ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
-)
 
 
 def options(spec: EnvSpec) -> Section:
     """Returns the table of an environment's options."""
     cells: list[tuple[object, ...]] = [
-        (name, _shown(default), data['unit'], data['meaning'])
-        for name, (default, data) in sorted(task_options(spec).items())
-        if data['actuation'] in (None, spec.actuation)
-    ]
-    cells += _EVERYWHERE
-    cells.append(('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'))
+        *(
+            (name, _shown(default), data['unit'], data['meaning'])
+            for name, (default, data) in sorted(task_options(spec).items())
+            if data['actuation'] in (None, spec.actuation)
+        ),
+        (', '.join(additions.OPTIONS), '-', '', 'custom functions; see docs/make_your_own.md'),
+        *((each.name, '-', '', each.metadata['meaning']) for each in dataclasses.fields(CommonOptions)),
+        ('random', '-', '', 'seed; by default drawn from the operating system'),
+        ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
+        ('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'),
+    ]  # fmt: skip
     return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
 
 

@@ -80,10 +80,12 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     """
     notices.compiling.about(spec.id)
     merged = {**spec.options, **(options or {})}
-    varied = {name: merged.pop(name) for name in variation.OPTIONS if name in merged}
-    actuators = Actuators.parse('actuators', varied.get('actuators', {}))
-    realism.check(actuators, spec.actuation)
-    type_, others = task_type(spec), (*variation.OPTIONS, 'random')
+    extras = {name: merged.pop(name) for name in variation.ADDITIONS if name in merged}
+    names = [each.name for each in dataclasses.fields(variation.CommonOptions)]
+    given = {name: merged.pop(name) for name in names if name in merged}
+    common = variation.CommonOptions.parse(spec.id, given)
+    realism.check(common.actuators, spec.actuation)
+    type_, others = task_type(spec), (*variation.ADDITIONS, *names, 'random')
     config_type, config = config_of(spec), None
     if config_type is None:
         known = task_options(spec)
@@ -99,17 +101,17 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
-    parts = _parts(spec, type_, actuators)
+    parts = _parts(spec, type_, common.actuators)
     if type_ is not None:
         task = type_.make(parts, config)
     else:
-        given: dict[str, Any] = merged if config is None else {'config': config}
+        own: dict[str, Any] = merged if config is None else {'config': config}
         if spec.clip is not None:
-            given['clip'] = parts.motion
+            own['clip'] = parts.motion
         task = spec.own['task_type'](
-            parts.character, parts.arena, actuation_model=parts.actuation, **given
+            parts.character, parts.arena, actuation_model=parts.actuation, **own
         )
-    for component in variation.components(varied, actuators, parts.character):
+    for component in variation.components(extras, common, parts.character):
         task.add(component)
     return task
 

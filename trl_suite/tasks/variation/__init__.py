@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -22,36 +23,53 @@ from trl_suite.tasks.variation import additions
 from trl_suite.tasks.variation.motors import Motors
 from trl_suite.tasks.variation.sensors import SensorConfig, Sensors
 from trl_suite.tasks.variation.worlds import WorldConfig, Worlds
-from trl_suite.util.options import Config
+from trl_suite.util.options import Config, option
 
 ADDITIONS = additions.OPTIONS
-DISTURBANCES: Mapping[str, tuple[type[Config], Any]] = {
-    'randomize': (WorldConfig, Worlds), 'sensors': (SensorConfig, Sensors),
-}  # fmt: skip
-OPTIONS = *ADDITIONS, 'actuators', *DISTURBANCES
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CommonOptions(Config):
+    """Options of every task, in addition to its own and to `ADDITIONS`."""
+
+    randomize: WorldConfig | None = option(
+        None, "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a "
+        'dict, see docs/realism_worlds.md',
+    )  # fmt: skip
+    sensors: SensorConfig | None = option(
+        None, "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
+        'docs/realism_worlds.md',
+    )  # fmt: skip
+    actuators: Actuators = option(
+        None, 'limits, delay, noise, strength, free play and elasticity of motors: a dict, see '
+        'docs/realism.md',
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        for name in ('randomize', 'sensors'):
+            if isinstance(getattr(self, name), Mapping) and not getattr(self, name):
+                self._set(name, None)  # nothing is asked for
+        super().__post_init__()
 
 
 def components(
-    options: Mapping[str, Any], actuators: Actuators, character: Character
+    added: Mapping[str, Any], options: CommonOptions, character: Character
 ) -> Iterator[Component]:
     """Yields the components that options ask for, in the order in which a task has them.
 
     Args:
-      options: values of `ADDITIONS` and `DISTURBANCES`. Of the latter: None; the name of a preset;
-        options by name, in which 'preset' may name a preset that the others change, None removing
-        one; or a config.
-      actuators: the motors.
-      character: the character whose joints they drive.
+      added: values of `ADDITIONS`.
+      options: the other options.
+      character: the character whose joints the motors drive.
 
     Raises:
-      ValueError: unknown names, values out of range, or options that contradict each other.
+      ValueError: invalid additions, or options that do not suit the character.
     """
-    if actuators.changed:
-        yield Motors(actuators, character)
-    added = {name: options[name] for name in ADDITIONS if name in options}
+    if options.actuators.changed:
+        yield Motors(options.actuators, character)
     if any(added.values()):
         yield additions.additions(added)
-    for name, (config, component) in DISTURBANCES.items():
-        value = options.get(name)
-        if value is not None and not (isinstance(value, Mapping) and not value):
-            yield component(config.parse(name, value))
+    if options.randomize is not None:
+        yield Worlds(options.randomize)
+    if options.sensors is not None:
+        yield Sensors(options.sensors)
