@@ -540,10 +540,15 @@ class RegisterTest(parameterized.TestCase):
 
     def test_parameters_with_limits(self):
         height = terrain.Parameter(0.5, 0.0, 2.0)
-        terrain.register('mine', {'H': height, 'W': 1})(terrain.GENERATORS['var2d_flat'].function)
+        low = terrain.Parameter(1, low=0)
+        terrain.register('mine', {'H': height, 'W': 1, 'L': low})(
+            terrain.GENERATORS['var2d_flat'].function
+        )
         terrain.load({'Type': 'mine', 'Params': [{'H': 2, 'W': -1e6}]})
         with self.assertRaisesRegex(ValueError, r'Params\[0\]: H is 3; expected .* from 0 to 2'):
             terrain.load({'Type': 'mine', 'Params': [{'H': 3}]})
+        with self.assertRaisesRegex(ValueError, 'L is -1; expected a number at least 0'):
+            terrain.load({'Type': 'mine', 'Params': [{'L': -1}]})
         with self.assertRaisesRegex(ValueError, 'H is 3; expected a number from 0 to 2'):
             terrain.register('other', {'H': height._replace(default=3)})
 

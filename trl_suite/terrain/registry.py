@@ -68,8 +68,8 @@ def check(
     """
     given = {}
     for key, value in values.items():
-        _, low, high, _ = parameters[key]
-        bounds: Any = {'at_least': low, 'at_most': high} if math.isfinite(high - low) else {}
+        bounds: Any = dict(zip(('at_least', 'at_most'), parameters[key][1:3], strict=True))
+        bounds = {word: bound for word, bound in bounds.items() if math.isfinite(bound)}
         given[key] = float(checked(f'{where}: {key}', value, float, **bounds))
     complete = {**{name: parameter.default for name, parameter in parameters.items()}, **given}
     for key in complete:
