@@ -9,7 +9,7 @@ parts that it calls:
 * seeds: streams of random numbers for terrain and goals
 * drawing: generation of terrain as arrays
 * start and goals: search for valid start and goal positions
-* laying: terrain windows for queries, geoms and their bounds
+* laying: terrain windows for queries, geoms and `mj_setConst`
 * physics: the engine's reset and forward
 * rest: the character's pose, observations, Python
 """

@@ -113,7 +113,7 @@ def allocates(n):
 class FunctionTest(parameterized.TestCase):
     """Features of compiled functions."""
 
-    def test_compiled_loops_accept_packs(self):
+    def test_compileds_accept_packs(self):
         pair = Pair(np.array([1.0, 2.0, 3.0]), np.zeros(3))
         scale_all(np.array([0, 2]), packed(pair))
         np.testing.assert_array_equal(pair.second, [-2, 0, 6])

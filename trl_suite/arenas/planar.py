@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -11,7 +11,7 @@ from dm_control import composer, mjcf
 from trl_suite.arenas import boxes, scene
 from trl_suite.arenas.boxes import Boxes
 from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.engine import World, bounds
+from trl_suite.engine import World
 from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.generators import BORDER
@@ -31,13 +31,6 @@ _WINDOW = _BEHIND + _AHEAD + 1  # vertices that have boxes
 _VERTICES = BEFORE + _WINDOW
 _CELLS_PER_METRE = 1 / SPACING
 _REACH = 0.5 * ADVANCE + SPACING  # m; distance from the centre beyond which a window is moved
-
-
-class Pool(NamedTuple):
-    """The boxes of one simulation, and their data in the engine."""
-
-    boxes: Boxes
-    geoms: bounds.Geoms
 
 
 class PlanarArena(composer.Arena):
@@ -82,12 +75,7 @@ class PlanarArena(composer.Arena):
         first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         pool = slice(first, first + len(self.boxes))
         self._pools = [
-            packed(
-                Pool(
-                    Boxes(model.geom_pos[pool], model.geom_size[pool], model.geom_quat[pool]),
-                    bounds.geoms(model),
-                )
-            )
+            packed(Boxes(model.geom_pos[pool], model.geom_size[pool], model.geom_quat[pool]))
             for model in world.models
         ]
         self.grounds: list[PlanarGround | None] = [None] * world.n
@@ -206,6 +194,7 @@ class PlanarArena(composer.Arena):
             env_id, centre, heights, vertical, pieces.number, pieces.level, pieces.ends, pieces.edges,
             boxes.angles(pieces), self._ground, self._pools[env_id],
         )  # fmt: skip
+        self._world.set_const(env_id)
 
 
 @compiled
@@ -235,7 +224,7 @@ def lay(
     edges: np.ndarray,
     angle: np.ndarray,
     ground: PlanarWindows,
-    pool: Pool,
+    pool: Boxes,
 ) -> None:
     """Writes vertices to the window of a simulation, and poses the boxes of their pieces."""
     ground.start[i] = centre - _BEHIND
@@ -243,12 +232,11 @@ def lay(
         ground.heights[i, k], ground.vertical[i, k] = heights[k], vertical[k]
         if k > 0:
             ground.rises[i, k - 1] = heights[k] - heights[k - 1]
-    boxes.pose(count, level, vertical[BEFORE:], ends, edges, angle, pool.boxes)
-    position, half_size = pool.boxes.position, pool.boxes.half_size
+    boxes.pose(count, level, vertical[BEFORE:], ends, edges, angle, pool)
+    position, half_size = pool.position, pool.half_size
     for k in range(count, len(position)):  # unused boxes
         position[k, 0], position[k, 1], position[k, 2] = (centre + _AHEAD) * SPACING, 0.0, PARKED
         half_size[k, 0] = half_size[k, 1] = half_size[k, 2] = 0.1
-    bounds.refresh(0, pool.geoms)
 
 
 @compiled

@@ -13,12 +13,12 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import scene
 from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.engine import World, bounds
+from trl_suite.engine import World
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
 from trl_suite.terrain.spatial.ground import Random
 from trl_suite.terrain.spatial.surroundings import ALL, EnvIds, positions
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
-from trl_suite.util.compiled import compiled, nearest_index, packed
+from trl_suite.util.compiled import compiled, nearest_index
 
 ELEVATION = 40.0  # m; largest difference of heights of a grid within a window
 BASE = 1.0  # m; thickness of height fields below their lowest point
@@ -147,11 +147,6 @@ class SpatialArena(composer.Arena):
         self._own = np.flatnonzero(own)
         for model in world.models:
             self.set_inertia(model)
-        placed = [*self.boxes[:1], *self.belts[:1], *(body.geom[0] for body in self.movers)]
-        placed += [geom for geom in (self.plane, self.field) if geom is not None]
-        geoms = world.geom_ids([geom.full_identifier for geom in placed])
-        self._placed = np.unique(world.models[0].geom_bodyid[geoms]).astype(int)
-        self._geoms = [packed(bounds.geoms(model)) for model in world.models]
 
     @property
     def grounds(self) -> list[SpatialGround | None]:
@@ -314,7 +309,7 @@ class SpatialArena(composer.Arena):
             cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
             east, north = belts.velocity.T
             run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
-        bounds.refresh_all(self._placed, self._geoms[env_id])
+        self._world.set_const(env_id)
         if self._field >= 0:
             self._show(model)
 
@@ -340,7 +335,7 @@ class SpatialArena(composer.Arena):
         self._world.qvel[env_id, self._dof] = around.direction[env_id] * around.speed[env_id]
 
     def set_inertia(self, model: mujoco.MjModel) -> None:
-        """Leaves moving boxes out of the mean inertia; necessary after every `mj_setConst`."""
+        """Leaves moving boxes out of the mean inertia."""
         if len(self._dof) and len(self._own):
             model.stat.meaninertia = model.dof_M0[self._own].mean()
 
