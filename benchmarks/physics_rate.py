@@ -140,7 +140,7 @@ class Subject:
             before = heights(0, np.zeros(1)).max()
             x, z = self.root_qpos
             self.data.qpos[x] = ON_TERRAIN
-            self.task.arena.follow(np.full((1, 1), ON_TERRAIN))
+            self.task.arena.recentre(np.zeros(1, int), np.array([ON_TERRAIN]))
             around = ON_TERRAIN + np.linspace(-REACH, REACH, 49)
             self.data.qpos[z] += heights(0, around).max() - before
             mujoco.mj_forward(self.model, self.data)

@@ -60,8 +60,7 @@ class SpatialGround:
         self.world.forward(np.zeros(1, int))
 
     def follow(self, x):
-        self.arena.follow(np.array([[float(x)]]))
-        self.world.forward(np.zeros(1, int))
+        self.arena.recentre(np.zeros(1, int), np.array([float(x)]))
 
     def ray(self, start, direction):
         """First hit of a ray: distance, normal, and whether it is the ground."""
@@ -199,16 +198,15 @@ class GeometryTest(parameterized.TestCase):
 
 
 class QueryTest(parameterized.TestCase):
-    """Height and slope are those of the ground, not of the boxes."""
+    """Heights are those of the ground, not of the boxes."""
 
     @parameterized.parameters('slopes_humanoid', 'gaps_humanoid', 'cliffs_rugged')
-    def test_height_and_slope(self, source):
+    def test_heights_ahead_and_behind(self, source):
         ground = SpatialGround(source, 4)
         for centre in (0.0, 9.0, -40.0, 500.0):
             ground.follow(centre)
             xs = np.random.default_rng(1).uniform(centre - 14.9, centre + 14.9, (1, 400))
             np.testing.assert_allclose(ground.arena.height(xs), ground.strip.height(xs), atol=1e-10)
-            np.testing.assert_allclose(ground.arena.slope(xs), ground.strip.slope(xs), atol=1e-9)
 
     def test_heights_at_vertices(self):
         ground = SpatialGround('slopes_humanoid', 4)
@@ -216,34 +214,14 @@ class QueryTest(parameterized.TestCase):
         xs = np.arange(-100, 300)[None] * CELL
         np.testing.assert_allclose(ground.arena.height(xs)[0], heights, atol=1e-10)
 
-    def test_far_heights(self):
-        ground = SpatialGround('slopes_mixed_humanoid', 4)
-        ground.follow(9.0)
-        arrays = ground.arena.ground
-        xs = np.linspace(-40, 60, 999)[None]
-        self.assertFalse(arrays.is_wide[0])
-        heights = ground.arena.height(xs)
-        ground.arena.look_far(xs, heights)
-        self.assertTrue(arrays.is_wide[0])
-        np.testing.assert_array_equal(heights, ground.strip.height(xs))
-        far = [planar_ground.far_height(0, x, arrays) for x in xs[0]]
-        np.testing.assert_array_equal(far, heights[0])
-        self.assertEqual(planar_ground.far_height(0, -1e300, arrays), arrays.wide[0, 0])
-        self.assertEqual(planar_ground.far_height(0, 1e300, arrays), arrays.wide[0, -1])
-        ground.follow(18.0)
-        self.assertFalse(arrays.is_wide[0])
-
     def test_functions_of_one_simulation(self):
         ground = SpatialGround('slopes_humanoid', 4)
         arrays = ground.arena.ground
         for x in (-17.9, -5.9, 0.0, 0.3, 3.0, 17.9):
             at = np.array([[x]])
             self.assertEqual(planar_ground.height(0, x, arrays), ground.arena.height(at)[0, 0])
-            self.assertEqual(planar_ground.slope(0, x, arrays), ground.arena.slope(at)[0, 0])
-            self.assertFalse(planar_ground.is_outside(0, x, arrays))
             self.assertEqual(planar_ground.has_left(0, x, arrays), abs(x) > 3.1)
         for x in (-18.1, 18.1, 1e300, -1e300):
-            self.assertTrue(planar_ground.is_outside(0, x, arrays))
             self.assertTrue(np.isfinite(planar_ground.height(0, x, arrays)))
         self.assertTrue(np.isnan(planar_ground.height(0, np.nan, arrays)))
         self.assertFalse(planar_ground.has_left(0, np.nan, arrays))
@@ -266,7 +244,7 @@ class PoolTest(parameterized.TestCase):
             for centre in range(-1, 10):
                 first = (centre - 1) * 240  # windows of 24 m, every 6 m
                 window = strip.window(first, 961)
-                most = max(most, len(boxes.from_profile(first, *window).position))
+                most = max(most, boxes.cut(first, *window).number)
         self.assertLessEqual(most, pool)
 
     def test_environments_use_these_terrains(self):
@@ -280,11 +258,12 @@ class PoolTest(parameterized.TestCase):
         self.assertFalse(deep.all())
 
     def test_boxes_follow_each_other(self):
-        strip = terrain.PlanarGround(terrain.load('slopes_mixed_humanoid'), 3)
-        pieces = boxes.from_profile(-240, *strip.window(-240, 961))
-        self.assertTrue((np.diff(pieces.position[:, 0]) > -0.5).all())
-        self.assertTrue((pieces.half_size > 0).all())
-        np.testing.assert_allclose(np.linalg.norm(pieces.quaternion, axis=1), 1)
+        model = SpatialGround('slopes_mixed_humanoid', 3).model
+        used = model.geom_pos[:, 2] > -50
+        self.assertGreater(used.sum(), 30)
+        self.assertTrue((np.diff(model.geom_pos[used, 0]) > -0.5).all())
+        self.assertTrue((model.geom_size > 0).all())
+        np.testing.assert_allclose(np.linalg.norm(model.geom_quat, axis=1), 1)
 
 
 class DynamicsTest(parameterized.TestCase):
@@ -324,7 +303,8 @@ class DynamicsTest(parameterized.TestCase):
         mujoco.mj_forward(model, data)
         energy = 0.5 * speed**2 + GRAVITY * data.qpos[1]
         for _ in range(round(30 * seconds)):
-            ground.arena.follow(data.qpos[:1][None])
+            if planar_ground.has_left(0, data.qpos[0], ground.arena.ground):
+                ground.follow(data.qpos[0])
             mujoco.mj_step(model, data, 10)
         ideal = np.sqrt(2 * (energy - GRAVITY * data.qpos[1]))
         self.assertLess(abs(data.qpos[1] - strip.height(data.qpos[0])), 0.06)
@@ -344,14 +324,14 @@ class DynamicsTest(parameterized.TestCase):
         for seed in range(3):
             source = {'Type': 'var2d_steps', 'Params': [steps]}
             strip = terrain.PlanarGround(terrain.load(source), seed)
-            self.assertGreater(len(boxes.from_profile(0, *strip.window(0, 240)).position), 12)
+            self.assertGreater(boxes.cut(0, *strip.window(0, 240)).number, 12)
             travel, ratio = self.slide(source, seed, 0, 2, 3)
             self.assertAlmostEqual(travel, 6, delta=0.02)
             self.assertAlmostEqual(ratio, 1, delta=0.002)
 
     def test_level_ground_is_one_box(self):
         strip = terrain.PlanarGround(terrain.load('flat'), 0)
-        self.assertLen(boxes.from_profile(-240, *strip.window(-240, 961)).position, 1)
+        self.assertEqual(boxes.cut(-240, *strip.window(-240, 961)).number, 1)
 
     def test_a_foot_slides_down_a_slope(self):
         for seed in range(4):

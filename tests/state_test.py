@@ -466,7 +466,7 @@ class FarTest(parameterized.TestCase):
         environment.reset()
         sizes = []
         for x in 0.0, 1e5:
-            environment.task.arena.follow(np.array([[x]]))
+            environment.task.arena.recentre(np.zeros(1, int), np.array([x]))
             ground = environment.task.arena.grounds[0]
             environment.physics.data.qpos[:2] = x, ground.height(x) + 1.0
             environment.task.world.forward(environment.task.world.all_ids)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.arenas.scene import PARKED
 from trl_suite.terrain import SPACING
 from trl_suite.util.compiled import compiled, compiled_inline
 
@@ -50,31 +51,20 @@ class Pieces(NamedTuple):
     edges: np.ndarray
 
 
-def from_profile(
-    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float = TOLERANCE
-) -> Boxes:
-    """Cuts a window of a profile into boxes.
-
-    Args:
-      start: number of the first vertex; vertex i is at x = i * SPACING.
-      heights: heights of the vertices, m, shape (m,).
-      vertical: True where the cell before a vertex is a vertical face, shape (m,).
-      tolerance: largest deviation of the profile from a tilted box longer than 0.1 m, m.
-
-    Returns:
-      Boxes whose upper faces follow the profile; their sides are in the middle of the vertical
-      cells.
-    """
-    pieces = cut(start, heights, vertical, tolerance)
-    boxes = Boxes(*(np.zeros((pieces.number, size)) for size in (3, 3, 4)))
-    pose(pieces.number, pieces.level, vertical, pieces.ends, pieces.edges, angles(pieces), boxes)
-    return boxes
-
-
 def cut(
     start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float = TOLERANCE
 ) -> Pieces:
-    """Cuts a window of a profile into pieces; arguments are those of `from_profile`."""
+    """Cuts a window of a profile into pieces, each of which becomes a box.
+
+    The upper faces of the boxes follow the profile; their sides are in the middle of the vertical
+    cells.
+
+    Args:
+      start: index of the first vertex; vertex i is at x = i * SPACING.
+      heights: heights of the vertices, m, shape (m,).
+      vertical: True where the cell before a vertex is a vertical face, shape (m,).
+      tolerance: largest deviation of the profile from a tilted box longer than 0.1 m, m.
+    """
     marks = np.empty((3, len(heights)), bool)
     ends, edges = np.empty((2, len(heights)), int), np.empty((5, len(heights)))
     _mark(start, heights, vertical, tolerance, marks)
@@ -199,26 +189,17 @@ def _join(
 
 
 @compiled
-def pose(
-    count: int,
-    level: bool,
-    vertical: np.ndarray,
-    ends: np.ndarray,
-    edges: np.ndarray,
-    angle: np.ndarray,
-    boxes: Boxes,
-) -> None:
-    """Writes the boxes of pieces to the first `count` boxes; changes `edges`.
+def pose(pieces: Pieces, vertical: np.ndarray, angle: np.ndarray, end: float, boxes: Boxes) -> None:
+    """Writes pieces to the first of the boxes, and parks the others; changes `pieces.edges`.
 
     Args:
-      count: number of pieces.
-      level: whether all pieces are level.
-      vertical: the vertical edges of the profile.
-      ends: vertices at both ends of each piece, see `Pieces`.
-      edges: positions of the pieces' edges.
+      pieces: at most as many as there are boxes.
+      vertical: the vertical faces of the profile.
       angle: angle of each piece, see `angles`.
-      boxes: at least `count` boxes.
+      end: x of the unused boxes, m.
+      boxes: the boxes.
     """
+    count, level, ends, edges = pieces
     if not level:
         _run_on(count, vertical, ends, edges)
     right_face = math.inf
@@ -251,6 +232,9 @@ def pose(
         boxes.half_size[k, 2] = 0.5 * thickness
         boxes.quaternion[k, 0] = math.cos(0.5 * angle[k])
         boxes.quaternion[k, 2] = -math.sin(0.5 * angle[k])
+    for k in range(count, len(boxes.position)):
+        boxes.position[k, 0], boxes.position[k, 1], boxes.position[k, 2] = end, 0.0, PARKED
+        boxes.half_size[k, 0] = boxes.half_size[k, 1] = boxes.half_size[k, 2] = 0.1
 
 
 @compiled

@@ -104,41 +104,6 @@ def empty_measurement(n: int, body: PlanarIds) -> PlanarMeasurement:
 
 
 @compiled
-def facing_of(i: int, body: PlanarIds, state: PlanarState) -> float:
-    """Returns 1, or -1 if the trunk points backwards: the terrain is then observed backwards."""
-    pitch = state.qpos[i, body.qpos[2]]
-    return -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
-
-
-@compiled
-def looks_outside(
-    i: int, facing: float, body: PlanarIds, state: PlanarState, ground: PlanarWindows
-) -> bool:
-    """Returns whether ground samples or end effectors of a character are outside its window."""
-    x = state.qpos[i, body.qpos[0]]
-    for sample in body.samples:
-        if planar_ground.is_outside(i, x + sample * facing, ground):
-            return True
-    for effector in body.effectors:
-        if planar_ground.is_outside(i, state.xpos[i, effector, 0], ground):
-            return True
-    return False
-
-
-@compiled
-def must_wait(i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows) -> bool:
-    """Returns whether `PlanarArena.widen` must be called before a character can be measured.
-
-    The terrain is drawn on demand; a character that points backwards may need ground outside its
-    window.
-    """
-    if ground.is_wide[i]:
-        return False
-    facing = facing_of(i, body, state)
-    return facing < 0.0 and looks_outside(i, facing, body, state, ground)
-
-
-@compiled
 def measure(
     i: int, body: PlanarIds, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
     measurement: PlanarMeasurement,
@@ -148,12 +113,12 @@ def measure(
     Positions are relative to the root, heights to the ground under it; x is mirrored while the trunk
     points backwards.
     """
-    facing = facing_of(i, body, state)
-    far = facing < 0.0 and ground.is_wide[i] and looks_outside(i, facing, body, state, ground)
+    pitch = state.qpos[i, body.qpos[2]]
+    facing = -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
     x, z = state.qpos[i, body.qpos[0]], state.qpos[i, body.qpos[1]]
     root = body.links[0]
     com_x, com_z = state.subtree_com[i, root, 0], state.subtree_com[i, root, 2]
-    under = planar_ground.far_height(i, x, ground) if far else planar_ground.height(i, x, ground)
+    under = planar_ground.height(i, x, ground)
     measurement.facing[i], measurement.under[i], measurement.height[i] = facing, under, z - under
 
     speed_x = speed_z = 0.0
@@ -174,20 +139,13 @@ def measure(
     measurement.com_velocity[i, 0], measurement.com_velocity[i, 1] = speed_x, speed_z
 
     for k in range(len(body.samples)):
-        ahead = x + body.samples[k] * facing
-        if far:
-            level = planar_ground.far_height(i, ahead, ground)
-        else:
-            level = planar_ground.height(i, ahead, ground)
+        level = planar_ground.height(i, x + body.samples[k] * facing, ground)
         observation[i, body.terrain + k] = level - under
     count = len(body.effectors)
     about = com_x if body.about_com else state.xpos[i, root, 0]
     for k in range(count):
         place = state.xpos[i, body.effectors[k], 0]
-        if far:
-            level = planar_ground.far_height(i, place, ground)
-        else:
-            level = planar_ground.height(i, place, ground)
+        level = planar_ground.height(i, place, ground)
         measurement.effectors[i, k] = place - about
         measurement.effectors[i, count + k] = state.xpos[i, body.effectors[k], 2] - level
 

@@ -161,7 +161,7 @@ class PlanarFigure:
 
     def follow(self, env_ids: np.ndarray) -> None:
         """Moves the ground windows of some simulations to the positions of their characters."""
-        self.arena.follow_all(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
+        self.arena.recentre(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
 
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray
@@ -183,10 +183,6 @@ class PlanarFigure:
         world.reset(env_ids)
         put_down(env_ids, poses, rates, extents, self.body, self._ground, world.qpos, world.qvel)
         world.forward(env_ids)
-
-    def feet(self) -> np.ndarray:
-        """Returns world positions of the end effectors, x and z, (n, E, 2) m."""
-        return self._world.xpos[:, self.effectors, ::2]
 
     def ground_heights(self, env_id: int, x: np.ndarray) -> np.ndarray:
         """Returns heights of the ground of one simulation at x (k,), m."""
