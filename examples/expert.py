@@ -162,13 +162,14 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
 
     def apart(env_id: int, place: np.ndarray) -> np.ndarray:
         """Returns the distance of every node from moving boxes at the time of arrival there, m."""
-        s = arena.surroundings
-        velocity = (s.direction[env_id] * s.speed[env_id])[:, None] * s.axis[env_id]
-        centre = s.centres()[env_id] - place
+        s = arena.surroundings.arrays
+        speed = s.mover_direction[env_id] * s.mover_speed[env_id]
+        velocity = speed[:, None] * s.mover_axis[env_id]
+        centre = arena.surroundings.centres()[env_id] - place
         near = np.abs(centre).max(1) < 2 * REACH
         seconds = np.linalg.norm(map_.places, axis=1) / PACE
         then = centre[near] + seconds[:, None, None] * velocity[near]
-        gap = np.abs(map_.places[:, None] - then) - s.half_size[env_id][near]
+        gap = np.abs(map_.places[:, None] - then) - s.mover_half_size[env_id][near]
         return np.linalg.norm(np.maximum(gap, 0), axis=2).min(1, initial=REACH)
 
     def plan(env_ids: np.ndarray, stance: np.ndarray) -> np.ndarray:

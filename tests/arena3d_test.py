@@ -12,6 +12,7 @@ from trl_suite import terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 from trl_suite.terrain.spatial import generators
+from trl_suite.terrain.spatial import windows as spatial_ground
 
 TIMESTEP = 1 / 300  # s
 SUBSTEPS = 10
@@ -269,7 +270,8 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage(source, load=CUBE)
         for seed in range(4):
             stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
-            speed = stage.arena.surface_velocity(np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
+            around = stage.arena.seen()
+            speed = around.velocity(np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
             self.assertAlmostEqual(abs(speed), {'conveyor3d': 0.4}.get(source, 0.6))
             stage.put((4, 0, 0.11))
             stage.run(1.0)
@@ -293,18 +295,16 @@ class DynamicsTest(parameterized.TestCase):
         self.assertEqual(signs, {True, False})
 
     def mover(self, stage, k):
-        around = stage.arena.surroundings
-        stage.arena._look(0)
-        speed = around.speed[0, k] * around.direction[0, k]
-        return around.centres()[0, k], speed * around.axis[0, k], around.half_size[0, k]
+        around, ground = stage.arena.seen(), stage.arena.surroundings.arrays
+        speed = ground.mover_speed[0, k] * ground.mover_direction[0, k]
+        velocity = speed * ground.mover_axis[0, k]
+        return around.centres()[0, k], velocity, ground.mover_half_size[0, k]
 
     def alone(self, stage):
         """The fastest moving box with nothing near its path for two seconds."""
-        around = stage.arena.surroundings
-        centres = around.centres()[0]
-        order = np.argsort(-around.speed[0])
-        for k in order.tolist():
-            way = centres[k] + around.direction[0, k] * around.axis[0, k] * around.speed[0, k] * 2
+        centres = stage.arena.surroundings.centres()[0]
+        for k in np.argsort(-stage.arena.surroundings.arrays.mover_speed[0]).tolist():
+            way = centres[k] + 2 * self.mover(stage, k)[1]
             gap = np.linalg.norm(centres - 0.5 * (centres[k] + way), axis=1)
             gap[k] = np.inf
             if gap.min() > 3.5 + np.linalg.norm(way - centres[k]) / 2 and np.abs(way).max() < 30:
@@ -380,15 +380,16 @@ class DynamicsTest(parameterized.TestCase):
         movers = stage.arena.grounds[0].layout.movers
         kinematic = terrain.Surroundings(1, stage.arena.capacity)
         kinematic.begin(0, stage.arena.grounds[0])
-        xy = np.array([(0.0, 0.0)])
+        expected, found = kinematic.arrays, stage.arena.surroundings.arrays
         for _ in range(900):
-            kinematic.turn(xy)
-            kinematic.distance += kinematic.direction * kinematic.speed / 30
-            stage.run(1 / 30, xy)
-        stage.arena._look(0)
-        np.testing.assert_allclose(stage.arena.surroundings.distance, kinematic.distance, atol=2e-3)
-        np.testing.assert_array_equal(stage.arena.surroundings.direction, kinematic.direction)
-        self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some reversed
+            spatial_ground.turn_movers(0, 0.0, 0.0, expected)
+            expected.mover_distance[:] += expected.mover_direction * expected.mover_speed / 30
+            stage.run(1 / 30, np.zeros((1, 2)))
+        stage.arena.seen()
+        np.testing.assert_allclose(found.mover_distance, expected.mover_distance, atol=2e-3)
+        np.testing.assert_array_equal(found.mover_direction, expected.mover_direction)
+        reversed_ = expected.mover_direction[0] != movers.direction
+        self.assertTrue(reversed_.any())
         # Queries and geometry agree on where they are.
         x, y = np.random.default_rng(0).uniform(-12, 12, (2, 400))
         stage.world.forward(stage.env_ids)
@@ -399,15 +400,13 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage('dynamic_obstacles3d', (7,), load=BALL)
         stage.world.reset(stage.env_ids)  # as placing a character does
         stage.world.forward(stage.env_ids)
-        stage.arena._look(0)
-        before = stage.arena.surroundings.centres()[0]
+        before = stage.arena.seen().centres()[0]
         movers = stage.arena.grounds[0].layout.movers
         begin = movers.start + movers.phase[:, None] * (movers.end - movers.start)
         np.testing.assert_allclose(before, begin, atol=1e-12)
         stage.put((0, 0, 50))
         stage.run(0.5, np.full((1, 2), 0.0))
-        stage.arena._look(0)
-        moved = np.linalg.norm(stage.arena.surroundings.centres()[0] - before, axis=1)
+        moved = np.linalg.norm(stage.arena.seen().centres()[0] - before, axis=1)
         np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
         self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
 
@@ -474,13 +473,13 @@ class QueryTest(parameterized.TestCase):
         cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
         x = xy[:, :1] + forward * cosine + right * sine
         y = xy[:, 1:] + forward * sine - right * cosine
-        heights = stage.arena.height_map(xy, heading)
+        around = stage.arena.seen()
+        heights = around.height_map(xy, heading)
         under = stage.arena.height(xy[:, :1], xy[:, 1:])
         off = np.abs(heights + under - stage.arena.height(x, y)) > 1e-6
         self.assertLessEqual(off.sum(), 1)  # within rounding of an edge
-        flow = stage.arena.surface_velocity(x, y)
-        flow = flow - stage.arena.surface_velocity(xy[:, :1], xy[:, 1:])
-        velocities = stage.arena.velocity_map(xy, heading).reshape(6, 2, 1024)
+        flow = around.velocity(x, y) - around.velocity(xy[:, :1], xy[:, 1:])
+        velocities = around.velocity_map(xy, heading).reshape(6, 2, 1024)
         ahead = flow[..., 0] * cosine + flow[..., 1] * sine
         aside = flow[..., 0] * sine - flow[..., 1] * cosine
         np.testing.assert_allclose(velocities[:, 0][~off], ahead[~off], atol=1e-12)
@@ -524,7 +523,8 @@ class WorldTest(parameterized.TestCase):
             stage.arena.follow(xy)
             stage.world.step(SUBSTEPS)
             xy = stage.position[:, :2].copy()
-            maps = stage.arena.height_map(xy, heading), stage.arena.velocity_map(xy, heading)
+            around = stage.arena.seen()
+            maps = around.height_map(xy, heading), around.velocity_map(xy, heading)
             seen.append(np.concatenate([stage.position, stage.velocity, *maps], 1))
         return np.stack(seen, 1)
 
@@ -576,7 +576,7 @@ class WorldTest(parameterized.TestCase):
         stage.arena.follow(np.array([(70.0, 3.0)]), env_ids)
         for env_id in (0, 2):
             np.testing.assert_array_equal(stage.world.models[env_id].geom_pos, models[env_id])
-        self.assertGreater(stage.arena.surroundings.centre[1, 0], 60)
+        self.assertGreater(stage.arena.surroundings.arrays.centre[1, 0], 60)
 
     def test_same_seed_same_ground(self):
         for source in ('hills3d', 'pillars3d'):

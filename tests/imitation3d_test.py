@@ -156,7 +156,8 @@ class ObservationTest(parameterized.TestCase):
     def test_height_map_equals_that_of_the_arena(self):
         environment, step = started(HILLS, 6, terrain_observation='height')
         probe = Probe(environment)
-        expected = environment.task.arena.height_map(probe.root[None, :2], probe.heading[None])
+        around = environment.task.arena.seen()
+        expected = around.height_map(probe.root[None, :2], probe.heading[None])
         self.assertEqual(step.observation['terrain'].shape, (1024,))
         np.testing.assert_allclose(step.observation['terrain'], expected[0], atol=1e-12)
 

@@ -16,7 +16,7 @@ from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
 from trl_suite.terrain.spatial.ground import Random
-from trl_suite.terrain.spatial.surroundings import ALL, EnvIds, positions
+from trl_suite.terrain.spatial.surroundings import ALL, EnvIds
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
 from trl_suite.util.compiled import compiled, nearest_index
 
@@ -164,7 +164,7 @@ class SpatialArena(composer.Arena):
           xy: start position of its character, m.
         """
         self.surroundings.begin(env_id, ground, xy)
-        self._begin[env_id] = self.surroundings.distance[env_id]
+        self._begin[env_id] = self.surroundings.arrays.mover_distance[env_id]
         self._world.qpos[env_id, self._qpos] = 0.0
         self._place(env_id)
         self._realise(env_id)
@@ -182,8 +182,10 @@ class SpatialArena(composer.Arena):
           ValueError: positions of another shape.
         """
         env_ids = self._world.all_ids if env_ids is None else self._world.all_ids[env_ids]
-        xy = positions(xy, len(env_ids))
-        changed = self.surroundings.follow(xy, env_ids)
+        xy = np.ascontiguousarray(xy, float)
+        if xy.shape != (len(env_ids), 2):
+            raise ValueError(f'xy has shape {xy.shape}; expected {(len(env_ids), 2)}')
+        changed = self.surroundings.recentre(env_ids, xy)
         for env_id in changed:
             self._realise(env_id)
         if len(self._dof):
@@ -195,37 +197,16 @@ class SpatialArena(composer.Arena):
         if changed:  # existing contacts refer to boxes that have moved
             self._world.forward(np.array(changed))
 
+    def seen(self, env_ids: EnvIds | int = ALL) -> Surroundings:
+        """Returns the surroundings, whose moving boxes are where the physics of simulations has them."""
+        if len(self._qpos):
+            moved = self._world.qpos[env_ids][..., self._qpos]
+            self.surroundings.arrays.mover_distance[env_ids] = self._begin[env_ids] + moved
+        return self.surroundings
+
     def height(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Heights of the surface in m at points (simulations, k) m, within 12 m of the characters."""
-        self._look(env_ids)
-        return self.surroundings.height(x, y, env_ids)
-
-    def surface_velocity(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
-        """Horizontal surface velocities at points (simulations, k) m, (simulations, k, 2) m/s."""
-        self._look(env_ids)
-        return self.surroundings.velocity(x, y, env_ids)
-
-    def height_map(
-        self,
-        xy: np.ndarray,
-        heading: np.ndarray,
-        env_ids: EnvIds = ALL,
-        out: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Heights around characters, (simulations, 1024) m; see `Surroundings.height_map`."""
-        self._look(env_ids)
-        return self.surroundings.height_map(xy, heading, env_ids, out)
-
-    def velocity_map(
-        self,
-        xy: np.ndarray,
-        heading: np.ndarray,
-        env_ids: EnvIds = ALL,
-        out: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Velocities of the surface, (simulations, 2048) m/s; see `Surroundings.velocity_map`."""
-        self._look(env_ids)
-        return self.surroundings.velocity_map(xy, heading, env_ids, out)
+        return self.seen(env_ids).height(x, y, env_ids)
 
     def goal(
         self,
@@ -236,20 +217,14 @@ class SpatialArena(composer.Arena):
         distance: float = 1.0,
     ) -> np.ndarray:
         """Draws a goal for one simulation, clear of boxes at present; see `SpatialGround.goal`."""
-        self._look(env_id)
-        ground = self.grounds[env_id]
+        ground, centres = self.grounds[env_id], self.seen(env_id).centres(np.array([env_id]))[0]
         assert ground is not None
-        movers = None
-        if ground.layout.movers is not None:
-            movers = self.surroundings.centres(np.array([env_id]))[
-                0, : len(ground.layout.movers.speed)
-            ]
+        movers = ground.layout.movers and centres[: len(ground.layout.movers.speed)]
         return ground.goal(random, root, rule, distance=distance, movers=movers)
 
     def state(self, env_id: int) -> dict[str, Any]:
         """Returns the state from which `restore` restores the ground of one simulation exactly."""
-        self._look(env_id)
-        return {**self.surroundings.state(env_id), 'begin': self._begin[env_id].copy()}
+        return {**self.seen(env_id).state(env_id), 'begin': self._begin[env_id].copy()}
 
     def restore(self, env_id: int, state: Mapping[str, Any]) -> None:
         """Restores the ground of one simulation; the caller restores the world afterwards."""
@@ -260,16 +235,10 @@ class SpatialArena(composer.Arena):
             self._place(env_id)
             self._realise(env_id)
 
-    def _look(self, env_ids: EnvIds | int) -> None:
-        """Reads the positions of moving boxes of some simulations from the physics."""
-        if len(self._qpos):
-            moved = self._world.qpos[env_ids][..., self._qpos]
-            self.surroundings.distance[env_ids] = self._begin[env_ids] + moved
-
     def _realise(self, env_id: int) -> None:
         """Poses the geoms of a simulation as in its window."""
         model, around = self._world.models[env_id], self.surroundings
-        ground, (x, y) = around.grounds[env_id], around.centre[env_id]
+        ground, (x, y) = around.grounds[env_id], around.arrays.centre[env_id]
         assert ground is not None
         level, floor = ground.layout.level, 0.0
         if self._plane >= 0:
@@ -281,7 +250,7 @@ class SpatialArena(composer.Arena):
                 return  # only a plane, which is in place already
             model.geom_pos[self._plane] = place
         if self._field >= 0:
-            heights = around.grid(env_id)
+            heights = around.arrays.grid[env_id].reshape(VERTICES, VERTICES)
             lowest, highest = float(heights.min()), float(heights.max())
             if not highest - lowest <= ELEVATION:
                 raise ValueError(
@@ -317,7 +286,8 @@ class SpatialArena(composer.Arena):
         """Sets the places of moving boxes at joint position 0, their axes, sizes and speeds."""
         if not len(self._bodies):
             return
-        model, around, ground = self._world.models[env_id], self.surroundings, self.grounds[env_id]
+        model, ground = self._world.models[env_id], self.grounds[env_id]
+        around = self.surroundings.arrays
         assert ground is not None and ground.layout.level is not None
         movers, level = ground.layout.movers, ground.layout.level
         count = 0 if movers is None else len(movers.speed)
@@ -325,14 +295,14 @@ class SpatialArena(composer.Arena):
         size = np.full((len(self._bodies), 3), SIZE)
         if movers is not None:
             moved = self._begin[env_id, :count, None]
-            position[:count, :2] = (
-                around.start[env_id, :count] + moved * around.axis[env_id, :count]
-            )
+            axis = around.mover_axis[env_id, :count]
+            position[:count, :2] = around.mover_start[env_id, :count] + moved * axis
             position[:count, 2] = level + 0.5 * movers.height
             size[:count, :2], size[:count, 2] = movers.half_size, 0.5 * movers.height
-            model.jnt_axis[self._joints[:count], :2] = around.axis[env_id, :count]
+            model.jnt_axis[self._joints[:count], :2] = axis
         model.body_pos[self._bodies], model.geom_size[self._mover_geoms] = position, size
-        self._world.qvel[env_id, self._dof] = around.direction[env_id] * around.speed[env_id]
+        speed = around.mover_direction[env_id] * around.mover_speed[env_id]
+        self._world.qvel[env_id, self._dof] = speed
 
     def set_inertia(self, model: mujoco.MjModel) -> None:
         """Leaves moving boxes out of the mean inertia."""
