@@ -1,5 +1,7 @@
 """Tests of the three-dimensional part of trl_suite.terrain: values from the original's description."""
 
+import copy
+import dataclasses
 import json
 import math
 import pathlib
@@ -60,6 +62,26 @@ def around(source, seeds, xy=None):
     for env_id, seed in enumerate(seeds):
         found.begin(env_id, terrain.SpatialGround(ground, seed), xy[env_id])
     return found
+
+
+def velocity_of(ground, x, y, centres=None, direction=None):
+    """Horizontal velocities of the surface at points, m/s, (*x.shape, 2)."""
+    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    layout, (px, py) = ground.layout, (x.ravel(), y.ravel())
+    still, found = copy.copy(ground), np.zeros((x.size, 2))
+    still.layout = dataclasses.replace(layout, belts=None, movers=None)
+    height, parts = still.height(px, py), []
+    if layout.belts is not None:
+        parts.append(layout.belts)
+    if layout.movers is not None:
+        movers = layout.movers
+        speed = movers.speed * (movers.direction if direction is None else direction)
+        parts.append((ground.movers(centres), speed[:, None] * movers.axis))
+    for boxes, velocities in parts:
+        tops = boxes.heights(px, py)
+        above = tops.max(1) > height
+        height[above], found[above] = tops.max(1)[above], velocities[tops.argmax(1)[above]]
+    return found.reshape(*x.shape, 2)
 
 
 def advance(found, dt, xy):
@@ -469,13 +491,13 @@ class MovingTest(parameterized.TestCase):
     def test_velocity_is_that_of_the_highest_part(self):
         ground = make('conveyor3d_wide', 1)
         speed = ground.layout.belts.velocity[0, 1]
-        velocity = ground.velocity([2.9, 3.1, 5.0, 5.0], [0, 0, 7.4, 7.6])
+        velocity = velocity_of(ground, [2.9, 3.1, 5.0, 5.0], [0, 0, 7.4, 7.6])
         np.testing.assert_allclose(velocity, [(0, 0), (0, speed), (0, speed), (0, 0)])
         np.testing.assert_allclose(ground.height([2.9, 3.1], [0, 0]), [0, 0.01])
         ground = make('dynamic_obstacles3d', 1)
         movers = ground.layout.movers
         middle = movers.start + movers.phase[:, None] * (movers.end - movers.start)
-        heights, velocity = ground.height(*middle.T), ground.velocity(*middle.T)
+        heights, velocity = ground.height(*middle.T), velocity_of(ground, *middle.T)
         over = np.abs(middle[:, None] - middle) <= movers.half_size
         top = np.where(over.all(2), movers.height, -1)
         np.testing.assert_array_equal(heights, top.max(1))
@@ -498,7 +520,7 @@ class GroundTest(parameterized.TestCase):
         self.assertEqual(sequence.n_children_spawned, 0)
         differs = not np.array_equal(first, make(source, 6).height(x, y))
         if source in MOVING:
-            flows = [make(source, seed).velocity(x, y) for seed in range(8)]
+            flows = [velocity_of(make(source, seed), x, y) for seed in range(8)]
             differs = any(not np.array_equal(flow, flows[0]) for flow in flows)
         drawn = source not in ('cliff3d', 'checkers3d', 'ramp3d', 'path3d', 'path3d_wide')
         self.assertEqual(differs, drawn)
@@ -512,7 +534,7 @@ class GroundTest(parameterized.TestCase):
             pickle.loads(pickle.dumps(ground)),
         ):
             np.testing.assert_array_equal(other.height(x, y), ground.height(x, y))
-            np.testing.assert_array_equal(other.velocity(x, y), ground.velocity(x, y))
+            np.testing.assert_array_equal(velocity_of(other, x, y), velocity_of(ground, x, y))
             self.assertEqual(
                 other.spawn(np.random.default_rng(3)), ground.spawn(np.random.default_rng(3))
             )
@@ -635,10 +657,10 @@ class GroundTest(parameterized.TestCase):
         for source in ('pillars3d', 'hills3d', 'stairs3d', 'trail3d1', 'dynamic_obstacles3d'):
             ground = make(source)
             x, y = np.array([(0.0, 3.0, -999_999.0, 5.0), (2.0, 9.0, 8.0, 999_999.0)])
-            heights, velocity = ground.height(x, y), ground.velocity(x, y)
+            heights, velocity = ground.height(x, y), velocity_of(ground, x, y)
             for k in range(4):
                 self.assertEqual(heights[k], ground.height(x[k], y[k]))
-                np.testing.assert_array_equal(velocity[k], ground.velocity(x[k], y[k]))
+                np.testing.assert_array_equal(velocity[k], velocity_of(ground, x[k], y[k]))
 
     def test_crowded_ground_terminates(self):
         crowd = {'Type': 'dynamic_obstacles3d', 'Params': [
@@ -749,7 +771,9 @@ class RegisterTest(parameterized.TestCase):
             np.testing.assert_allclose(
                 heights[env_id], ground.height(x[env_id], y[env_id]), atol=1e-12
             )
-            np.testing.assert_array_equal(velocity[env_id], ground.velocity(x[env_id], y[env_id]))
+            np.testing.assert_array_equal(
+                velocity[env_id], velocity_of(ground, x[env_id], y[env_id])
+            )
             self.assertGreater(np.ptp(heights[env_id][heights[env_id] > 0.41]), 0.2)  # the slope
             area = (heights[env_id] > 0.45).mean() * 256
             self.assertBetween(area, 3, 6)
@@ -857,7 +881,9 @@ class SurroundingsTest(parameterized.TestCase):
             np.testing.assert_allclose(
                 heights[env_id], ground.height(x[env_id], y[env_id]), atol=2e-6
             )
-            np.testing.assert_array_equal(velocity[env_id], ground.velocity(x[env_id], y[env_id]))
+            np.testing.assert_array_equal(
+                velocity[env_id], velocity_of(ground, x[env_id], y[env_id])
+            )
         env_ids = np.array([1, 4])
         np.testing.assert_array_equal(
             found.height(x[env_ids], y[env_ids], env_ids), heights[env_ids]
@@ -940,8 +966,8 @@ class SurroundingsTest(parameterized.TestCase):
             # Within rounding of an edge of a box either side may be taken.
             off = np.abs(heights[env_id] - expected) > 3e-6
             differing += off.sum()
-            flow = ground.velocity(*points[env_id].T, centres, direction)
-            flow = flow - ground.velocity(*xy[env_id], centres, direction)
+            flow = velocity_of(ground, *points[env_id].T, centres, direction)
+            flow = flow - velocity_of(ground, *xy[env_id], centres, direction)
             cosine, sine = np.cos(heading[env_id]), np.sin(heading[env_id])
             forward = flow @ (cosine, sine)
             right = flow @ (sine, -cosine)

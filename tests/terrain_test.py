@@ -749,19 +749,11 @@ class PlanarGroundTest(parameterized.TestCase):
         self.assertBetween(low, -360, -333.3)
         self.assertBetween(high, 444.4, 480)
 
-    def test_slope(self):
-        strip = self.make('slopes')
-        x = (np.arange(-800, 800) + 0.5) * 0.025
-        expected = (strip.height(x + 0.01) - strip.height(x - 0.01)) / 0.02
-        np.testing.assert_allclose(strip.slope(x), expected, atol=1e-9)
-        self.assertEqual(strip.slope(0.3), 0)
-
     @parameterized.parameters(math.nan, math.inf, -math.inf, 1.1e6, -1.1e6)
     def test_invalid_arguments_are_rejected(self, x):
         strip = self.make()
         for request in (
             lambda: strip.height([0.0, x]),
-            lambda: strip.slope(x),
             lambda: strip.ensure(0, x),
             lambda: strip.ensure(x, 0),
             lambda: self.make(spawn='upstream', centre=x),

@@ -185,18 +185,18 @@ class PlanarGround:
         Raises:
           ValueError: a value of x is not finite, or further than LONGEST from 0.
         """
-        left, rise, fraction = self._cell(x)
-        return left + fraction * rise
-
-    def slope(self, x: npt.ArrayLike) -> np.ndarray:
-        """Returns dh/dx of the cells that contain x (m); at a vertex, of the cell to its right.
-
-        Vertical faces are one cell wide, as in the polyline.
-
-        Raises:
-          ValueError: as `height`.
-        """
-        return self._cell(x)[1] / SPACING
+        x = np.asarray(x, dtype=float)
+        if not x.size:
+            return x
+        position = x / SPACING
+        lo, hi = float(position.min()), float(position.max())
+        if not (lo >= -LONGEST / SPACING and hi <= LONGEST / SPACING):  # also refuses NaN
+            raise ValueError(f'x must be finite and within {LONGEST:g} m of 0, not {x}')
+        self._extend(math.floor(lo), math.floor(hi) + 1)
+        number = np.floor(position)
+        i = number.astype(int) - self._low
+        left = self._heights[i]
+        return left + (position - number) * (self._heights[i + 1] - left)
 
     def state(self) -> dict[str, Any]:
         """Returns a state from which `from_state` continues exactly as this ground would.
@@ -255,21 +255,6 @@ class PlanarGround:
                 f'{x[wrong]:g} m; expected finite heights'
             )
         return heights
-
-    def _cell(self, x: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the height of the vertex left of x, the rise over the cell, and x in the cell."""
-        x = np.asarray(x, dtype=float)
-        if not x.size:
-            return x, x, x
-        position = x / SPACING
-        lo, hi = float(position.min()), float(position.max())
-        if not (lo >= -LONGEST / SPACING and hi <= LONGEST / SPACING):  # also refuses NaN
-            raise ValueError(f'x must be finite and within {LONGEST:g} m of 0, not {x}')
-        self._extend(math.floor(lo), math.floor(hi) + 1)
-        number = np.floor(position)
-        i = number.astype(int) - self._low
-        left = self._heights[i]
-        return left, self._heights[i + 1] - left, position - number
 
     def _extend(self, low: int, high: int) -> None:
         """Generates stretches until the vertices from low to high exist; forgets those far away."""

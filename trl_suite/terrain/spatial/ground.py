@@ -107,70 +107,29 @@ class SpatialGround:
         Raises:
           ValueError: a point is not finite, or further than LONGEST from the origin.
         """
-        return self._look(x, y, movers)[0]
-
-    def velocity(
-        self,
-        x: npt.ArrayLike,
-        y: npt.ArrayLike,
-        movers: np.ndarray | None = None,
-        direction: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Horizontal velocities of the surface at points, m/s, of shape `(*x.shape, 2)`.
-
-        Args:
-          x, y: m, of one shape.
-          movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
-          direction: direction of the moving boxes, 1 or -1, (k,); their initial ones if None.
-
-        Raises:
-          ValueError: as for `height`.
-        """
-        return self._look(x, y, movers, direction)[1]
-
-    def _look(
-        self,
-        x: npt.ArrayLike,
-        y: npt.ArrayLike,
-        centres: np.ndarray | None = None,
-        direction: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Heights and velocities of the surface at points."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         if not (np.abs(x) <= LONGEST).all() or not (np.abs(y) <= LONGEST).all():
             raise ValueError(f'points must be finite and within {LONGEST:g} m of 0')
         shape, x, y = x.shape, x.ravel(), y.ravel()
         spread = [np.ptp(part) for part in (x, y) if x.size > 1]
         if spread and (max(spread) > FAR_APART or math.prod(spread) > AREA):
-            each = [self._look(*point, centres, direction) for point in zip(x, y, strict=True)]
-            found = [np.stack(part) for part in zip(*each, strict=True)]
-            return found[0].reshape(shape), found[1].reshape(*shape, 2)
+            each = [self.height(*point, movers) for point in zip(x, y, strict=True)]
+            return np.reshape(each, shape)
         layout = self.layout
-        height = np.full(len(x), -np.inf if layout.level is None else layout.level)
-        velocity = np.zeros((len(x), 2))
+        heights = np.full(len(x), -np.inf if layout.level is None else layout.level)
         if not len(x):
-            return height.reshape(shape), velocity.reshape(*shape, 2)
-
-        def cover(boxes: Boxes, velocities: np.ndarray | float) -> None:
-            tops = boxes.heights(x, y)
-            if tops.size:
-                best = tops.argmax(1)
-                top = tops[np.arange(len(x)), best]
-                above = top > height
-                height[above] = top[above]
-                velocity[above] = np.broadcast_to(velocities, (tops.shape[1], 2))[best[above]]
-
+            return heights.reshape(shape)
         if layout.grid is not None:
-            np.maximum(height, self._on_grid(x, y), out=height)
+            np.maximum(heights, self._on_grid(x, y), out=heights)
         points = np.stack([x, y], 1)
-        cover(layout.boxes_in(points.min(0), points.max(0)), 0.0)
+        parts = [layout.boxes_in(points.min(0), points.max(0))]
         if layout.belts is not None:
-            cover(*layout.belts)
+            parts.append(layout.belts.boxes)
         if layout.movers is not None:
-            movers = layout.movers
-            direction = movers.direction if direction is None else direction
-            cover(self.movers(centres), (direction * movers.speed)[:, None] * movers.axis)
-        return height.reshape(shape), velocity.reshape(*shape, 2)
+            parts.append(self.movers(movers))
+        for boxes in parts:
+            np.maximum(heights, boxes.heights(x, y).max(1, initial=-np.inf), out=heights)
+        return heights.reshape(shape)
 
     def movers(self, centres: np.ndarray | None = None) -> Boxes:
         """The moving boxes as `Boxes`; `centres` are `movers` of `height`."""
