@@ -1,8 +1,8 @@
 """Collision boxes for a planar height profile: exact vertical faces, no ghost edges.
 
 A profile is cut into pieces: level runs become one box each, sloped stretches become tilted boxes
-as long as the profile stays within a tolerance of them. Cuts depend on absolute vertex numbers
-only, so the surface under a character does not change when the window of boxes moves.
+as long as the profile stays within a tolerance of them. Cuts depend on absolute indices of
+vertices only, so the surface under a character does not change when the window of boxes moves.
 """
 
 from __future__ import annotations

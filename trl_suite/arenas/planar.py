@@ -120,7 +120,7 @@ class PlanarArena(composer.Arena):
             self._lay(env_id, state['centre'])
 
     def _lay(self, env_id: int, centre: int) -> None:
-        """Fills a window around vertex number `centre`, and poses its boxes."""
+        """Fills a window around the vertex with index `centre`, and poses its boxes."""
         strip = self.grounds[env_id]
         assert strip is not None
         start = centre - BEHIND
