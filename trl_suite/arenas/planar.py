@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import composer
 
 from trl_suite.arenas import boxes, scene
 from trl_suite.arenas.boxes import Boxes
@@ -46,7 +46,10 @@ class PlanarArena(composer.Arena):
         self.terrain = terrain
         root = self._mjcf_root
         scene.prepare(root, look)
-        _paint(root, look)
+        # The checker spans the width of the ground once, and its edge has the colour of the sides,
+        # so that sides of overlapping tilted boxes cannot be told apart.
+        edge = [EDGE * part for part in look.ground[1]]
+        scene.paint(root, 'ground', look.ground, 2, mark='edge', markrgb=edge)
         # A default class, since formatting the attributes of each box takes most of the time.
         ground_class = root.default.add('default', dclass='ground')
         ground_class.geom.set_attributes(
@@ -171,18 +174,3 @@ def _pool_size(terrain: Terrain) -> int:
             )
             most = max(most, boxes.cut(k * _WINDOW, *window).number)
     return round(SPARE * most) + PROBES
-
-
-def _paint(root: mjcf.RootElement, look: scene.Look) -> None:
-    """Adds the texture and the material of the ground."""
-    light, dark = look.ground
-    # The checker spans the width of the ground once, and its edge has the colour of the sides, so
-    # that sides of overlapping tilted boxes cannot be told apart.
-    root.asset.add(
-        'texture', name='ground', type='2d', builtin='checker', mark='edge', width=256, height=256,
-        rgb1=light, rgb2=dark, markrgb=[EDGE * part for part in dark],
-    )  # fmt: skip
-    root.asset.add(
-        'material', name='ground', texture='ground', texuniform=True, reflectance=0, specular=0,
-        texrepeat=(2, 2),
-    )  # fmt: skip

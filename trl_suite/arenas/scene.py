@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dm_control import mjcf
 
@@ -85,4 +85,18 @@ def _decorate(root: mjcf.RootElement, look: Look) -> None:
     root.asset.add(
         'texture', name='sky', type='skybox', builtin='gradient', rgb1=look.sky[0],
         rgb2=look.sky[1], width=64, height=64,
+    )  # fmt: skip
+
+
+def paint(
+    root: mjcf.RootElement, name: str, colours: tuple[Colour, Colour], repeat: int = 1, **more: Any
+) -> None:
+    """Adds a checkered texture, and its material; `more` are attributes of the texture."""
+    root.asset.add(
+        'texture', name=name, type='2d', builtin='checker', width=256, height=256,
+        rgb1=colours[0], rgb2=colours[1], **more,
+    )  # fmt: skip
+    root.asset.add(
+        'material', name=name, texture=name, texuniform=True, reflectance=0, specular=0,
+        texrepeat=(repeat, repeat),
     )  # fmt: skip

@@ -31,6 +31,11 @@ SIZE = 0.1  # m; half sides of unused boxes
 SHADES = np.array(
     [[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]], np.float32
 )  # of boxes, alternating every 0.5 m along x
+COLOURS = {
+    'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),
+    'belt': ((0.34, 0.38, 0.44), (0.42, 0.46, 0.52)),
+    'mover': ((0.66, 0.50, 0.30), (0.61, 0.46, 0.27)),
+}
 
 
 class SpatialArena(composer.Arena):
@@ -55,7 +60,8 @@ class SpatialArena(composer.Arena):
         self.capacity = holds = capacity(terrain)
         root = self._mjcf_root
         scene.prepare(root, look)
-        _paint(root, look)
+        for name, colours in {'ground': look.ground, **COLOURS}.items():
+            scene.paint(root, name, colours)
         # Parts of the ground do not collide with each other: moving boxes pass through them.
         # A default class, since formatting the attributes of each box takes most of the time.
         ground_class = root.default.add('default', dclass='ground')
@@ -384,22 +390,3 @@ def _write_boxes(
         shade = nearest_index(np.floor(2 * middle[k, 0]) % 2.0, len(shades))
         for channel in range(4):
             geom_rgba[geom, channel] = shades[shade, channel]
-
-
-def _paint(root: mjcf.RootElement, look: scene.Look) -> None:
-    """Adds the textures and materials of the ground."""
-    colours = {
-        'ground': look.ground,
-        'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),
-        'belt': ((0.34, 0.38, 0.44), (0.42, 0.46, 0.52)),
-        'mover': ((0.66, 0.50, 0.30), (0.61, 0.46, 0.27)),
-    }
-    for name, (light, dark) in colours.items():
-        root.asset.add(
-            'texture', name=name, type='2d', builtin='checker', width=256, height=256, rgb1=light,
-            rgb2=dark,
-        )  # fmt: skip
-        root.asset.add(
-            'material', name=name, texture=name, texuniform=True, reflectance=0, specular=0,
-            texrepeat=(1, 1),
-        )  # fmt: skip
