@@ -86,7 +86,7 @@ class Stage:
 
     def run(self, seconds, xy=None):
         for _ in range(round(30 * seconds)):
-            self.arena.follow(self.xy if xy is None else xy)
+            self.arena.recentre(self.env_ids, self.xy if xy is None else xy)
             self.world.step(SUBSTEPS)
 
     def height(self, x, y, env_id=0):
@@ -129,11 +129,11 @@ class GeometryTest(parameterized.TestCase):
         rng = np.random.default_rng(0)
         for x in np.arange(0, 60, 3.1):
             xy = np.array([(x, 0.4 * x)])
-            stage.arena.follow(xy)
+            stage.arena.recentre(stage.env_ids, xy)
             px, py = xy[0][:, None] + rng.uniform(-11.9, 11.9, (2, 20))
             expected = stage.arena.grounds[0].height(px, py)
             np.testing.assert_allclose(stage.rays(px, py), expected, atol=SINGLE)
-        stage.arena.follow(np.zeros((1, 2)))
+        stage.arena.recentre(stage.env_ids, np.zeros((1, 2)))
         px, py = rng.uniform(-11.9, 11.9, (2, 50))
         expected = stage.arena.grounds[0].height(px, py)
         np.testing.assert_allclose(stage.rays(px, py), expected, atol=SINGLE)
@@ -315,7 +315,7 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
         k = self.alone(stage)
         near = self.mover(stage, k)[0][None]  # a character nearby, so that it does not reverse
-        stage.arena.follow(near)
+        stage.arena.recentre(stage.env_ids, near)
         centre, velocity, _ = self.mover(stage, k)
         stage.put((*centre, stage.height(*centre)[0] + 0.1), (*velocity, 0))
         stage.run(2.0, near)
@@ -332,7 +332,7 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
         k = self.alone(stage)
         near = self.mover(stage, k)[0][None]
-        stage.arena.follow(near)
+        stage.arena.recentre(stage.env_ids, near)
         centre, velocity, half = self.mover(stage, k)
         speed = np.linalg.norm(velocity)
         ahead = velocity / speed
@@ -445,11 +445,9 @@ class DynamicsTest(parameterized.TestCase):
 
     def test_positions_of_other_shapes_are_rejected(self):
         arena = Stage('dynamic_obstacles3d', (5, 6, 7), batch=True).arena
-        for xy, env_ids in (
-            (np.zeros((1, 2)), None), (np.zeros((3, 1)), None), (np.zeros((1, 2)), np.arange(3)),
-        ):  # fmt: skip
+        for xy in np.zeros((1, 2)), np.zeros((3, 1)):
             with self.assertRaisesRegex(ValueError, r'xy has shape .*; expected \(3, 2\)'):
-                arena.follow(xy, env_ids)
+                arena.recentre(np.arange(3), xy)
 
     def test_moving_boxes_touch_neither_ground_nor_each_other(self):
         stage = Stage('dynamic_obstacles3d', (5,))
@@ -520,7 +518,7 @@ class WorldTest(parameterized.TestCase):
         seen = []
         for _ in range(steps):
             xy = stage.position[:, :2].copy()
-            stage.arena.follow(xy)
+            stage.arena.recentre(stage.env_ids, xy)
             stage.world.step(SUBSTEPS)
             xy = stage.position[:, :2].copy()
             around = stage.arena.seen()
@@ -573,7 +571,7 @@ class WorldTest(parameterized.TestCase):
         env_ids = np.array([1])
         stage.arena.begin_episode(1, terrain.SpatialGround(stage.arena.terrain, 77), (50.0, 3.0))
         self.assertFalse(np.array_equal(stage.world.models[1].geom_pos, models[1]))
-        stage.arena.follow(np.array([(70.0, 3.0)]), env_ids)
+        stage.arena.recentre(env_ids, np.array([(70.0, 3.0)]))
         for env_id in (0, 2):
             np.testing.assert_array_equal(stage.world.models[env_id].geom_pos, models[env_id])
         self.assertGreater(stage.arena.surroundings.arrays.centre[1, 0], 60)
@@ -606,8 +604,8 @@ class WorldTest(parameterized.TestCase):
 
         def picture(arena, environment, seed, x):
             arena.begin_episode(0, terrain.SpatialGround(arena.terrain, seed))
-            arena.follow(np.array([(x, 0.0)]))
-            arena.follow(np.zeros((1, 2)))
+            for place in (x, 0.0):
+                arena.recentre(np.zeros(1, int), np.array([(place, 0.0)]))
             environment.physics.forward()
             return environment.physics.render(60, 80, 'above').astype(int)
 

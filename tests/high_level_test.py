@@ -436,7 +436,7 @@ class MapTest(parameterized.TestCase):
         task = environment.task
         place = body(environment, 'xpos', 'root')
         carry(environment, (1.5 - place[0], -place[1], 0), yaw=-heading_of(environment))
-        task.arena.follow(np.array([[1.5, 0.0]]))
+        task.arena.recentre(np.zeros(1, int), np.array([[1.5, 0.0]]))
         task.observe()
         ahead, right = environment.observation()['surface'].reshape(2, 1024)
         x, y = 1.5 + self.POINTS[0], self.POINTS[1]

@@ -175,19 +175,16 @@ class SpatialArena(composer.Arena):
         self._place(env_id)
         self._realise(env_id)
 
-    def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> None:
-        """Moves windows with their characters, and keeps boxes moving.
-
-        Called before every control step.
+    def recentre(self, env_ids: np.ndarray, xy: np.ndarray) -> None:
+        """Moves windows that characters have left, and keeps boxes moving.
 
         Args:
-          xy: positions of their roots, m, (n, 2), or of the given simulations only, (m, 2).
-          env_ids: sorted indices of simulations; None for all.
+          env_ids: sorted indices of simulations, (m,).
+          xy: positions of the roots of their characters, (m, 2) m.
 
         Raises:
           ValueError: positions of another shape.
         """
-        env_ids = self._world.all_ids if env_ids is None else self._world.all_ids[env_ids]
         xy = np.ascontiguousarray(xy, float)
         if xy.shape != (len(env_ids), 2):
             raise ValueError(f'xy has shape {xy.shape}; expected {(len(env_ids), 2)}')

@@ -157,9 +157,9 @@ class PlanarFigure:
           action: actions of all simulations, (n, k), in [-1, 1].
         """
         if control_all(env_ids, action, self._pack):
-            self.follow(env_ids[self.data.leaving[env_ids]])
+            self.recentre(env_ids[self.data.leaving[env_ids]])
 
-    def follow(self, env_ids: np.ndarray) -> None:
+    def recentre(self, env_ids: np.ndarray) -> None:
         """Moves the ground windows of some simulations to the positions of their characters."""
         self.arena.recentre(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
 

@@ -173,13 +173,16 @@ class SpatialFigure:
           action: actions of all simulations, (n, k), in [-1, 1].
         """
         if control_all(env_ids, action, self._data_pack):
-            leaving = env_ids[self.data.leaving[env_ids]]
-            self.arena.follow(self._world.xpos[leaving, self.links[0], :2], leaving)
+            self.recentre(env_ids[self.data.leaving[env_ids]])
 
     def measure(self, env_ids: np.ndarray | None = None) -> SpatialMeasurement:
         """Measures the characters of some simulations, or of all; returns `measurement`."""
         measure_all(self._world.all_ids if env_ids is None else env_ids, self._pack)
         return self.measurement
+
+    def recentre(self, env_ids: np.ndarray) -> None:
+        """Moves the ground windows of some simulations to the positions of their characters."""
+        self.arena.recentre(env_ids, self._world.xpos[env_ids, self.links[0], :2])
 
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray

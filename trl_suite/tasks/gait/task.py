@@ -295,7 +295,7 @@ class GaitTask(Task):
         while run(env_ids, self.watch is not None, self._pack):
             leaving = env_ids[interruption[env_ids] == _GROUND]
             if len(leaving):
-                self.figure.follow(leaving)
+                self.figure.recentre(leaving)
             if self.watch is not None and (interruption[env_ids] == _LOOK).any():
                 self.watch()
 
