@@ -1,7 +1,8 @@
 """Configures Sphinx: `pip install -e '.[docs]' && sphinx-build -W docs site`.
 
 The pages are Markdown that reads as well on GitHub. What only the site needs is added here: the
-navigation of generated pages, pages from outside docs/, and moving pictures of the environments:
+pages of each environment, family, character and terrain with their navigation and the links to them,
+pages from outside docs/, and moving pictures of the environments:
 `-D moving_pictures='*'`, or another pattern of ids, renders those that are missing.
 """
 
@@ -21,6 +22,7 @@ from trl_suite.registry import catalogue
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent))
 import gallery
+import generate
 
 DOCS = pathlib.Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -37,6 +39,13 @@ PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()} | {
     DOCS / 'README.md': 'index.md',
 }
 LINK = re.compile(r'(?<=\]\()(?![a-z]+:|#)([^)#\s]+)')
+# A cell of a table that is a name, and the pages of environments, characters and others by name.
+CELL = re.compile(r'(?<=\| )`([\w/-]+)`(?= \|)')
+SUBJECTS = {
+    name: f'{folder}/{generate.slug(name)}.md'
+    for folder, (_, names) in generate.SITE.items()
+    for name in names
+}
 STRIP = re.compile(r'!\[Film strip\]\(\S*/environments/(\S+)\.jpg\)')
 
 project = 'trl_suite'
@@ -80,14 +89,11 @@ def navigation(name: str) -> str:
     """Returns the part of the navigation below a page."""
     folder, _, stem = name.partition('/')
     pages = []
-    if name == 'environments/README':
-        pages = [
-            f'../families/{domain}' for domain in dict.fromkeys(s.domain for s in catalogue.SPECS)
-        ]
-    elif folder == 'families':
+    if folder == 'families':
         pages = [f'../environments/{spec.id}.md' for spec in catalogue.SPECS if spec.domain == stem]
-    elif name in ('characters/README', 'terrains/README'):
-        pages = sorted(p.name for p in (DOCS / folder).glob('*.md') if p.stem != 'README')
+    elif name in generate.SITE:
+        below = 'families' if name == 'environments' else name
+        pages = [SUBJECTS[each] for each in generate.SITE[below][1]]
     return '\n'.join(['', '```{toctree}', ':hidden:', *pages, '```', '']) if pages else ''
 
 
@@ -103,7 +109,13 @@ def read(app: Any, name: str, source: list[str]) -> None:
         target = pathlib.Path(os.path.normpath(start / match[1]))
         return os.path.relpath(DOCS / PAGES[target] if target in PAGES else target, own.parent)
 
-    source[0] = STRIP.sub(moving, LINK.sub(inside, text)) + navigation(name)
+    def page_of(match: re.Match[str]) -> str:
+        if (subject := SUBJECTS.get(match[1])) is None:
+            return match[0]
+        return f'[{match[0]}]({os.path.relpath(DOCS / subject, own.parent)})'
+
+    text = CELL.sub(page_of, LINK.sub(inside, text))
+    source[0] = STRIP.sub(moving, text) + navigation(name)
 
 
 def moving(match: re.Match[str]) -> str:
@@ -150,6 +162,7 @@ def render(app: Any) -> None:
 
 def setup(app: Any) -> None:
     app.add_config_value('moving_pictures', '', 'env', str)
+    app.connect('builder-inited', lambda app: generate.write_site())
     app.connect('builder-inited', render)
     app.connect('source-read', read)
     app.connect('autodoc-process-docstring', mark_code)

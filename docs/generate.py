@@ -1,10 +1,11 @@
 """Writes the reference pages from the catalogue and the code, and renders their pictures.
 
-    python docs/generate.py [--overwrite] [--filter PATTERN] [--pages] [--check]
+    python docs/generate.py [--overwrite] [--filter PATTERN] [--pages]
 
-All pages are written. Pictures are rendered if they are missing or show a policy that has been
-replaced; --overwrite renders all. Needs `pip install 'trl_suite[video]'`. With --check nothing is
-written, and the exit status is 1 if a page is out of date.
+The repository keeps the pages of `pages`. Those of `site_pages`, which describe one environment,
+family, character or terrain each, are not tracked: the build of the site writes them, too. Pictures
+are rendered if they are missing or show a policy that has been replaced; --overwrite renders all.
+Needs `pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import pathlib
 import statistics
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import gallery
@@ -32,6 +33,7 @@ from trl_suite.tasks.variation import sensors, worlds
 from trl_suite.util import files, resources
 
 DOCS = pathlib.Path(__file__).resolve().parent
+SOURCES = 'trl_suite', 'trained', 'xml', 'mocap'  # what the pages of the site describe
 NAMES = (  # parts of ids
     ('`FSM`', 'a finite state machine drives the joints; an action sets its parameters'),
     (
@@ -69,35 +71,26 @@ FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
 
 
 def pages() -> dict[str, str]:
-    """Returns the text of every page by its path below docs/."""
-    found = {'README.md': home()}
-    environments: dict[Any, Any] = {}
-    for spec in catalogue.SPECS:
-        # Environments that differ only in terrain are built once.
-        key = (
-            spec.task_type,
-            spec.character,
-            spec.actuation,
-            spec.clip,
-            repr(sorted(spec.options.items())),
-        )
-        if key not in environments:
-            environments[key] = suite.build_environment(spec, {}, {})
-        found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
-    found['environments/README.md'] = environment_index()
-    for domain in catalogue.FAMILIES:
-        found[f'families/{domain}.md'] = family_page(domain)
-    for name in characters.CHARACTERS:
-        found[f'characters/{name}.md'] = character_page(name)
-    found['characters/README.md'] = character_index()
-    for name in presets():
-        found[f'terrains/{slug(name)}.md'] = terrain_page(name)
-    found['terrains/README.md'] = terrain_index()
-    found['speed.md'] = speed_page()
-    found['leaderboard.md'] = leaderboard()
-    found[REALISM] = realism()
-    found[README] = readme()
-    return found
+    """Returns the text of every page that the repository keeps, by its path below docs/."""
+    return {
+        'README.md': home(),
+        'environments.md': environment_index(),
+        'characters.md': character_index(),
+        'terrains.md': terrain_index(),
+        'speed.md': speed_page(),
+        'leaderboard.md': leaderboard(),
+        REALISM: realism(),
+        README: readme(),
+    }
+
+
+def site_pages() -> dict[str, Callable[[], str]]:
+    """Returns a function for every page that only the site has, by its path below docs/."""
+    return {
+        f'{folder}/{slug(name)}.md': functools.partial(text, name)
+        for folder, (text, names) in SITE.items()
+        for name in names
+    }
 
 
 def presets() -> tuple[str, ...]:
@@ -135,11 +128,13 @@ def home() -> str:
         table(
             ('reference, generated from the code', ''),
             (
-                ('[Environments](environments/README.md)', f'{len(catalogue.SPECS)}, one page each'),
-                ('[Characters](characters/README.md)', f'{len(characters.CHARACTERS)}, with their joints'),
-                ('[Terrains](terrains/README.md)', f'{len(presets())} presets, with their parameters'),
+                ('[Environments](environments.md)', f'{len(catalogue.SPECS)} in {len(catalogue.FAMILIES)} families'),
+                ('[Characters](characters.md)', len(characters.CHARACTERS)),
+                ('[Terrains](terrains.md)', f'{len(presets())} presets'),
             ),
         ),
+        'The site has a page for each of them, and the reference of the Python interface: `pip install -e '
+        "'.[docs]' && sphinx-build docs site`. `trl-suite info ID` prints the page of an environment.",
         table(
             ('guide', ''),
             (
@@ -165,7 +160,21 @@ def home() -> str:
 # Environments
 
 
-def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
+_BUILT: dict[Any, Any] = {}
+
+
+def built(spec: catalogue.EnvSpec) -> Any:
+    """Returns the environment of a spec, or of one that differs only in terrain."""
+    options_ = repr(sorted(spec.options.items()))
+    key = spec.task_type, spec.character, spec.actuation, spec.clip, options_
+    if key not in _BUILT:
+        _BUILT[key] = suite.build_environment(spec, {}, {})
+    return _BUILT[key]
+
+
+def environment_page(id: str) -> str:
+    spec = catalogue.BY_ID[id]
+    environment = built(spec)
     also = (f'{spec.domain}/{spec.task}', *spec.aliases)
     facts = (
         ('other names', ', '.join(f'`{name}`' for name in also)),
@@ -300,24 +309,26 @@ def family_page(domain: str) -> str:
 
 
 def environment_index() -> str:
-    shipped = policies.available()
     parts = []
     for domain, title in catalogue.FAMILIES.items():
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         cells = [
             (
-                f'[{spec.id}]({spec.id}.md)', spec.description, links('characters', [spec.character]),
-                links('terrains', [spec.terrain]), spec.actuation, 'yes' if spec.id in shipped else '',
+                f'`{spec.id}`',
+                spec.description,
+                f'`{spec.character}`',
+                f'`{spec.terrain}`',
+                spec.actuation,
             )
             for spec in specs
-        ]  # fmt: skip
-        header = ('environment', 'task', 'character', 'terrain', 'actuation', 'policy')
+        ]
+        header = ('environment', 'task', 'character', 'terrain', 'actuation')
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Environments',
         f'{len(catalogue.SPECS)} environments in {len(catalogue.FAMILIES)} families; a trained policy is shipped '
-        f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
-        'character, actuation, terrain or tag, and `trl-suite info ID` prints the content of a page. The ids '
+        f'for {len(policies.available())} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
+        'character, actuation, terrain or tag, and `trl-suite info ID` describes one. The ids '
         'are those of the original, including its misspellings.',
         table(('part of an id', 'meaning'), NAMES),
         *parts,
@@ -363,7 +374,7 @@ def character_page(name: str) -> str:
 def character_index() -> str:
     cells = [
         (
-            f'[{name}]({name}.md)', picture(name, gallery.character_path(name)), spec.description,
+            f'`{name}`', f'![{name}](pictures/{gallery.character_path(name)})', spec.description,
             sum(each.character == name for each in catalogue.SPECS),
         )
         for name, spec in characters.CHARACTERS.items()
@@ -373,7 +384,7 @@ def character_index() -> str:
         '`suite.build` combines a character with any terrain of the same dimension and with position, '
         f'velocity or torque control; {", ".join(MUSCLES)} also have muscles. A character without a clip '
         "needs `task='walk'` or a custom clip. For custom characters see "
-        '[Make your own](../make_your_own.md).',
+        '[Make your own](make_your_own.md).',
         table(('character', '', 'description', 'environments'), cells),
     )
 
@@ -427,7 +438,7 @@ def terrain_index() -> str:
     ):
         cells = [
             (
-                f'[{name}]({slug(name)}.md)', f'`{ground.type}`', meaning(ground),
+                f'`{name}`', f'`{ground.type}`', meaning(ground),
                 max(len(ground.parameter_sets), 1),
                 sum(spec.terrain == name for spec in catalogue.SPECS),
             )
@@ -439,9 +450,18 @@ def terrain_index() -> str:
         'Terrains',
         'Terrain is generated anew in every episode. `trl-suite terrain NAME` plots random samples of a '
         'preset or of a parameter file. For terrain from a function, an image or a mesh see '
-        '[Make your own](../make_your_own.md).',
+        '[Make your own](make_your_own.md).',
         *parts,
     )
+
+
+# Pages that only the site has: what writes one, and what they are about, by folder.
+SITE: dict[str, tuple[Callable[[str], str], Iterable[str]]] = {
+    'environments': (environment_page, catalogue.BY_ID),
+    'families': (family_page, catalogue.FAMILIES),
+    'characters': (character_page, characters.CHARACTERS),
+    'terrains': (terrain_page, presets()),
+}
 
 
 # Leaderboard
@@ -459,7 +479,7 @@ def leaderboard() -> str:
         results = sorted(results_of(spec), key=lambda named: -named[1][by])
         cells += [
             (
-                f'[{spec.id}](environments/{spec.id}.md)', rank, name,
+                f'`{spec.id}`', rank, name,
                 '–' if by == 'distance' else f'{result["normalized_return"]:.3f}',
                 f'{result["completion_rate"]:.0%}', f'{result["distance"]:.1f}', result['episodes'],
             )
@@ -694,19 +714,38 @@ def speed_page() -> str:
 
 
 def stale(found: dict[str, str]) -> Iterator[str]:
-    """Yields the paths of pages that are out of date, missing, or obsolete."""
+    """Yields the paths of pages that are out of date or missing."""
     for path, text in found.items():
         file = DOCS / path
         if not file.exists() or file.read_text(encoding='utf-8') != text:
             yield path
-    yield from gone(found)
 
 
-def gone(found: dict[str, str]) -> list[str]:
-    """Returns the paths of pages whose subject no longer exists."""
-    there = [p.relative_to(DOCS) for name in ('environments', 'families', 'characters', 'terrains')
-             for p in (DOCS / name).glob('*.md')]  # fmt: skip
-    return [path.as_posix() for path in there if path.as_posix() not in found]
+def write(path: str, text: str) -> None:
+    file = DOCS / path
+    file.parent.mkdir(exist_ok=True)
+    with files.replacing(file) as part:
+        part.write_text(text, encoding='utf-8')
+
+
+def write_site() -> int:
+    """Writes the pages that only the site has, except those newer than all that they describe.
+
+    Returns:
+      Number of written pages.
+    """
+    used = [*DOCS.glob('*.py')]
+    for folder in SOURCES:
+        used += (path for path in (DOCS.parent / folder).rglob('*.*') if path.suffix != '.pyc')
+    newest = max(path.stat().st_mtime for path in used)
+    old = {
+        path: text
+        for path, text in site_pages().items()
+        if not (file := DOCS / path).exists() or file.stat().st_mtime < newest
+    }
+    for path, text in old.items():
+        write(path, text())
+    return len(old)
 
 
 def main() -> int:
@@ -716,24 +755,12 @@ def main() -> int:
         '--filter', default='*', metavar='PATTERN', help='render only matching pictures, e.g. an id'
     )
     parser.add_argument('--pages', action='store_true', help='write pages only, no pictures')
-    parser.add_argument(
-        '--check', action='store_true', help='write nothing; fail if a page is out of date'
-    )
     arguments = parser.parse_args()
     found = pages()
     old = list(stale(found))
-    if arguments.check:
-        print('\n'.join(f'docs/{path} is out of date; run docs/generate.py' for path in old))
-        return int(bool(old))
-    for path in gone(found):
-        print(f'docs/{path} has no subject; remove it')
-    old = [path for path in old if path in found]
     for path in old:
-        file = DOCS / path
-        file.parent.mkdir(exist_ok=True)
-        with files.replacing(file) as part:
-            part.write_text(found[path], encoding='utf-8')
-    print(f'{len(old)} pages written')
+        write(path, found[path])
+    print(f'{len(old) + write_site()} pages written')
     if arguments.pages:
         return 0
     written, failed = gallery.make(DOCS / 'pictures', arguments.filter, arguments.overwrite)

@@ -1,6 +1,7 @@
 """The pages in docs/ and the README: up to date, with existing link targets; their pictures."""
 
 import json
+import os
 import pathlib
 import re
 import sys
@@ -27,37 +28,98 @@ LARGEST = 12e6  # bytes of all pictures
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
 
 
-class PagesTest(absltest.TestCase):
+def only_on_the_site(path):
+    return path.relative_to(DOCS).parts[0] in generate.SITE
+
+
+def tracked_pages():
+    """Returns the pages in docs/ that the repository keeps, as paths."""
+    return [path for path in DOCS.rglob('*.md') if not only_on_the_site(path)]
+
+
+class PagesTest(parameterized.TestCase):
     def test_pages_are_up_to_date(self):
         """Generated pages equal the stored ones: run `python docs/generate.py` if this fails."""
-        pages = generate.pages()
-        self.assertEqual(list(generate.stale(pages)), [])
-        for folder, names in (
-            ('environments', catalogue.BY_ID), ('characters', generate.characters.CHARACTERS),
-            ('terrains', map(generate.slug, generate.presets())),
-        ):  # fmt: skip
-            for name in names:
-                self.assertIn(f'{folder}/{name}.md', pages)
+        self.assertEqual(list(generate.stale(generate.pages())), [])
+
+    def test_indexes_name_everything(self):
+        for page, names in (
+            ('environments', catalogue.BY_ID),
+            ('characters', characters.CHARACTERS),
+            ('terrains', generate.presets()),
+        ):
+            rows = re.findall(
+                r'^\| `(\S+)` \|', (DOCS / f'{page}.md').read_text('utf-8'), re.MULTILINE
+            )
+            self.assertContainsSubset(names, rows)
+
+    def test_pages_of_the_site_are_not_tracked(self):
+        ignored = (ROOT / '.gitignore').read_text(encoding='utf-8').splitlines()
+        left_out = (ROOT / 'MANIFEST.in').read_text(encoding='utf-8').splitlines()
+        for folder in generate.SITE:
+            self.assertIn(f'/docs/{folder}/', ignored)
+            self.assertIn(f'prune docs/{folder}', left_out)
+
+    @parameterized.parameters(
+        ('PD_Biped2D_Gaps_Terrain-v0', 'pose', 'end_effector', 'terrain_observation'),
+        ('FSM_Hopper2D_Terrain_Walls-v0', 'velocity', 'speed', 'base_actions'),
+    )
+    def test_the_page_of_an_environment(self, id_, observed, rewarded, option):
+        text = self.page(f'environments/{id_}.md')
+        spec = catalogue.BY_ID[id_]
+        self.assertStartsWith(text, f'# {id_}\n\n{spec.description}\n')
+        tables = dict(re.findall(r'^## (\w+).*\n\n(\|[^#]*)', text, re.MULTILINE))
+        for title, header, row in (
+            ('Observation', '| block | from | to | size | unit | meaning |', observed),
+            ('Action', '| index |', ''),
+            ('Reward', '| term | weight | scale | unit | error, or share |', rewarded),
+            ('Options', '| option | default | unit | meaning |', option),
+            ('Links', '| link and joint | kg |', ''),
+        ):
+            self.assertStartsWith(tables[title], header)
+            self.assertIn(f'\n| {row}', tables[title])
+        self.assertIn('\n## Differences from the original\n\n- ', text)
+
+    def test_the_pages_of_a_family_a_character_and_a_terrain(self):
+        self.assertIn(f'| [{GAPS}](../environments/{GAPS}.md)<br>', self.page('families/plaid.md'))
+        self.assertIn(
+            '\n## Links and joints\n\n| link and joint | kg |', self.page('characters/dog.md')
+        )
+        terrains = self.page('terrains/injectinput_slopes.md')
+        self.assertIn('\n## Parameters\n\n| parameter | unit | value |', terrains)
+
+    def page(self, path):
+        """Returns the text of a page of the site, all of whose links have targets."""
+        pages = generate.site_pages()
+        text = pages[path]()
+        for link in _LINK.findall(text):
+            target = (DOCS / path).parent.joinpath(link).resolve()
+            found = target.relative_to(DOCS).as_posix() in pages or target.exists()
+            self.assertTrue(found, f'{path}: {link}')
+        return text
 
     def test_links_have_targets(self):
-        """Every link target of a page exists, and is not empty."""
-        files = [ROOT / 'README.md', *DOCS.rglob('*.md')]
-        for file in files:
+        """Every link target of a page is in the repository, and is not empty."""
+        for file in (ROOT / 'README.md', *tracked_pages()):
             for link in _LINK.findall(file.read_text(encoding='utf-8')):
-                target = file.parent / link
+                target = (file.parent / link).resolve()
                 self.assertTrue(target.exists(), f'{file}: {link}')
+                if target.is_relative_to(DOCS):
+                    self.assertFalse(only_on_the_site(target), f'{file}: {link}')
                 if target.is_file():
                     self.assertGreater(target.stat().st_size, 0, f'{file}: {link}')
 
     def test_pictures_are_small_and_used(self):
-        pictures = [path for path in (DOCS / 'pictures').rglob('*') if path.is_file()]
+        pictures = {path for path in (DOCS / 'pictures').rglob('*') if path.is_file()}
         self.assertLess(sum(path.stat().st_size for path in pictures), LARGEST)
+        made = {DOCS / 'pictures' / item.path for item in gallery.items()}
+        self.assertEqual(made - pictures, set())
         linked = {
             (file.parent / link).resolve()
-            for file in (ROOT / 'README.md', *DOCS.rglob('*.md'))
+            for file in (ROOT / 'README.md', *tracked_pages())
             for link in _LINK.findall(file.read_text(encoding='utf-8'))
         }
-        self.assertEqual({path.resolve() for path in pictures} - linked, set())
+        self.assertEqual(pictures - made - linked, set())
 
     def test_numbers_in_the_readme(self):
         text = (ROOT / 'README.md').read_text(encoding='utf-8')
@@ -65,6 +127,18 @@ class PagesTest(absltest.TestCase):
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
+
+
+class SitePagesTest(FolderTest):
+    def test_only_pages_older_than_the_sources_are_written(self):
+        (self.folder / 'generate.py').touch()
+        site = {'terrains': (str.upper, ['a/b', 'c'])}
+        with mock.patch.multiple(generate, DOCS=self.folder, SITE=site, SOURCES=()):
+            self.assertEqual([generate.write_site() for _ in range(2)], [2, 0])
+            path = self.folder / 'terrains' / 'a_b.md'
+            self.assertEqual(path.read_text(), 'A/B')
+            os.utime(path, (0, 0))
+            self.assertEqual([generate.write_site() for _ in range(2)], [1, 0])
 
 
 class GalleryTest(FolderTest):
@@ -241,20 +315,26 @@ class SiteTest(absltest.TestCase):
             '[a](contributing.md#layers) [b](../examples/ppo.py) [c](#d)',
         )
 
+    def test_names_in_tables_are_links(self):
+        self.assertLen(conf.SUBJECTS, len(generate.site_pages()))  # no name has two meanings
+        self.assertEqual(
+            self.page('guide', f'`{GAPS}`\n\n| `{GAPS}` | `injectinput/slopes` | `else` |'),
+            f'`{GAPS}`\n\n| [`{GAPS}`](environments/{GAPS}.md) '
+            '| [`injectinput/slopes`](terrains/injectinput_slopes.md) | `else` |',
+        )
+
     def test_every_page_is_in_the_navigation(self):
         index = (DOCS / 'index.md').read_text(encoding='utf-8')
         listed = {
             f'{name}.md' for name in re.findall(r'^[a-z_]+(?:/README)?$', index, re.MULTILINE)
         }
-        for folder in ('environments', 'families', 'characters', 'terrains'):
-            for page in (DOCS / folder).glob('*.md'):
-                name = page.relative_to(DOCS).with_suffix('').as_posix()
-                listed |= {
-                    str((page.parent / below).resolve().relative_to(DOCS)).removesuffix('.md')
-                    + '.md'
-                    for below in conf.navigation(name).splitlines()[3:-1]
-                }
-        pages = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob('*.md')}
+        pages = {path.relative_to(DOCS).as_posix() for path in tracked_pages()}
+        pages |= {*generate.site_pages()}
+        for page in pages:
+            listed |= {
+                f'{(DOCS / page).parent.joinpath(below).resolve().relative_to(DOCS)}'
+                for below in conf.navigation(page.removesuffix('.md')).splitlines()[3:-1]
+            }
         self.assertEqual(
             pages - listed - {'README.md', 'index.md', 'clients.md', 'cluster.md'}, set()
         )

@@ -2,7 +2,7 @@
 'use strict';
 
 const NUMBER = /^[-+]?\d[\d.]*/;
-const FILTERS = ['character', 'terrain', 'actuation', 'policy'];
+const FILTERS = ['character', 'terrain', 'actuation'];
 
 const text = (element) => element.textContent.trim();
 
