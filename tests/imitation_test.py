@@ -8,7 +8,7 @@ from helpers import made
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
-from trl_suite.tasks import task, terms
+from trl_suite.tasks import terms
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
@@ -236,7 +236,7 @@ class RewardTest(parameterized.TestCase):
         ((0, 0, 0, 0, 0.01), 'root', 0.905), ((0, 0, 0, 0.1, 0), 'com', 0.368),
     )  # fmt: skip
     def test_worked_values(self, errors, term, factor):
-        outcome = task.outcome(1, 0, len(errors))
+        outcome = terms.outcome(1, 0, len(errors))
         data = terms.terms_data(rewards.IMITATION_TERMS)
         for name, error in zip(data._fields, errors, strict=True):
             terms.score(0, float(error), getattr(data, name), outcome)

@@ -13,7 +13,8 @@ from trl_suite.kinematics.blocks import Block
 from trl_suite.util.random import Streams
 
 if TYPE_CHECKING:
-    from trl_suite.tasks.task import Marker, Outcome, Task
+    from trl_suite.tasks.task import Marker, Task
+    from trl_suite.tasks.terms import Outcome
 
 
 # Spawn keys of the streams of components.

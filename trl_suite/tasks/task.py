@@ -19,9 +19,8 @@ from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.kinematics.blocks import Block, layout
 from trl_suite.tasks.component import Component, position, seed_of
-from trl_suite.tasks.terms import Term
+from trl_suite.tasks.terms import Outcome, Term, outcome
 from trl_suite.util import errors
-from trl_suite.util.compiled import compiled
 
 MOST_SUBSTEPS = 1000  # physics steps per control step
 MOST_SAMPLES = 10_000  # heights observed on a line
@@ -55,55 +54,6 @@ class Marker(NamedTuple):
     size: Sequence[float]
     colour: tuple[float, float, float, float]
     yaw: float = 0.0
-
-
-class Outcome(NamedTuple):
-    """The results of a step, with a leading axis of n simulations.
-
-    Attributes:
-      observation: all observation blocks, concatenated, (n, observation size).
-      reward: (n,).
-      reward_terms: weighted terms of the reward, (n, terms); 0 after a reset.
-      failed: whether the episode has ended with discount 0, (n,) bool.
-      diverged: whether it failed because the physics diverged, (n,) bool.
-      fell: whether it failed for another reason, a fall or a landing error, (n,) bool.
-    """
-
-    observation: np.ndarray
-    reward: np.ndarray
-    reward_terms: np.ndarray
-    failed: np.ndarray
-    diverged: np.ndarray
-    fell: np.ndarray
-
-
-def outcome(n: int, size: int, terms: int = 0) -> Outcome:
-    """Allocates the outcome of n simulations, for a size of observations and a number of terms."""
-    return Outcome(
-        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
-    )  # fmt: skip
-
-
-@compiled
-def begin(i: int, outcome: Outcome) -> None:
-    """Resets the outcome of a simulation, except its observation."""
-    outcome.reward[i] = 0.0
-    outcome.failed[i] = outcome.diverged[i] = outcome.fell[i] = False
-    for k in range(outcome.reward_terms.shape[1]):
-        outcome.reward_terms[i, k] = 0.0
-
-
-@compiled
-def conclude(i: int, failed: bool, outcome: Outcome) -> None:
-    """Sets the reward to the sum of its terms, or both to 0 if the episode has failed."""
-    outcome.failed[i] = failed
-    outcome.fell[i] = failed and not outcome.diverged[i]
-    reward = 0.0
-    for k in range(outcome.reward_terms.shape[1]):
-        if failed:
-            outcome.reward_terms[i, k] = 0.0
-        reward += outcome.reward_terms[i, k]
-    outcome.reward[i] = reward
 
 
 class Task(composer.Task):

@@ -1,4 +1,4 @@
-"""Reward terms as data, and the compiled functions that write them.
+"""The outcome of a step, and reward terms as data, with the compiled functions that write them.
 
 A task declares its terms once, beside the compiled function that computes them. That function reads
 weights and scales by name, as in `score(i, error, rules.terms.pose, rules.outcome)`; indices, `info`
@@ -10,15 +10,61 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.kinematics.blocks import by_name
 from trl_suite.util.compiled import compiled
 
-if TYPE_CHECKING:
-    from trl_suite.tasks.task import Outcome
+
+class Outcome(NamedTuple):
+    """The results of a step, with a leading axis of n simulations.
+
+    Attributes:
+      observation: all observation blocks, concatenated, (n, observation size).
+      reward: (n,).
+      reward_terms: weighted terms of the reward, (n, terms); 0 after a reset.
+      failed: whether the episode has ended with discount 0, (n,) bool.
+      diverged: whether it failed because the physics diverged, (n,) bool.
+      fell: whether it failed for another reason, a fall or a landing error, (n,) bool.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    reward_terms: np.ndarray
+    failed: np.ndarray
+    diverged: np.ndarray
+    fell: np.ndarray
+
+
+def outcome(n: int, size: int, terms: int = 0) -> Outcome:
+    """Allocates the outcome of n simulations, for a size of observations and a number of terms."""
+    return Outcome(
+        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
+    )  # fmt: skip
+
+
+@compiled
+def begin(i: int, outcome: Outcome) -> None:
+    """Resets the outcome of a simulation, except its observation."""
+    outcome.reward[i] = 0.0
+    outcome.failed[i] = outcome.diverged[i] = outcome.fell[i] = False
+    for k in range(outcome.reward_terms.shape[1]):
+        outcome.reward_terms[i, k] = 0.0
+
+
+@compiled
+def conclude(i: int, failed: bool, outcome: Outcome) -> None:
+    """Sets the reward to the sum of its terms, or both to 0 if the episode has failed."""
+    outcome.failed[i] = failed
+    outcome.fell[i] = failed and not outcome.diverged[i]
+    reward = 0.0
+    for k in range(outcome.reward_terms.shape[1]):
+        if failed:
+            outcome.reward_terms[i, k] = 0.0
+        reward += outcome.reward_terms[i, k]
+    outcome.reward[i] = reward
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,8 @@ import numpy as np
 
 from trl_suite.kinematics.blocks import CLOCK, Block, Reflection
 from trl_suite.kinematics.spatial import SpatialBodyData, look
-from trl_suite.tasks.task import CONTROL_TIMESTEP, PHASE_BINS, Outcome
+from trl_suite.tasks.task import CONTROL_TIMESTEP, PHASE_BINS
+from trl_suite.tasks.terms import Outcome
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_inline

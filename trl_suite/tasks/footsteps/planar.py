@@ -30,8 +30,8 @@ from trl_suite.tasks.components.footstep_plan import (
 from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.imitation import planar as imitation
 from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, PlanarImitation
-from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
-from trl_suite.tasks.terms import Term, give, score
+from trl_suite.tasks.task import Marker, drawn_seed
+from trl_suite.tasks.terms import Term, begin, conclude, give, score
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option

@@ -30,8 +30,7 @@ from trl_suite.tasks.components.spatial_rules import (
     publish,
     tick,
 )
-from trl_suite.tasks.task import Outcome, conclude
-from trl_suite.tasks.terms import Term, facing, give, score, wrapped
+from trl_suite.tasks.terms import Outcome, Term, conclude, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled
 
 TERMS = (

@@ -21,12 +21,7 @@ from trl_suite.kinematics.planar import (
     leaves,
     measure,
 )
-from trl_suite.tasks.task import (
-    Outcome,
-    begin,
-    conclude,
-)
-from trl_suite.tasks.terms import Term, give, score
+from trl_suite.tasks.terms import Outcome, Term, begin, conclude, give, score
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
 

@@ -37,15 +37,12 @@ from trl_suite.tasks.task import (
     START_PHASE,
     SUBSTEPS,
     TERRAIN_LEVEL,
-    Outcome,
     Task,
-    begin,
     check_position_options,
-    conclude,
     drawn_seed,
     start_phases,
 )
-from trl_suite.tasks.terms import score, terms_data, wrapped
+from trl_suite.tasks.terms import Outcome, begin, conclude, score, terms_data, wrapped
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option

@@ -37,8 +37,8 @@ from trl_suite.tasks.components.spatial_rules import (
     tick,
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
-from trl_suite.tasks.task import Outcome, conclude, drawn_seed
-from trl_suite.tasks.terms import score
+from trl_suite.tasks.task import drawn_seed
+from trl_suite.tasks.terms import Outcome, conclude, score
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option

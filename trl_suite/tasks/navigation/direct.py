@@ -58,8 +58,8 @@ from trl_suite.tasks.components.trace import Trace, follow, trace, trace_markers
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.imitation.spatial import check_cycle, clip_action, cycle_poses, pose_of_clip
 from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, Outcome, conclude
-from trl_suite.tasks.terms import Term, facing, give, score, wrapped
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
+from trl_suite.tasks.terms import Outcome, Term, conclude, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Range, option
 

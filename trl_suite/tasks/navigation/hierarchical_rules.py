@@ -31,8 +31,8 @@ from trl_suite.tasks.components.spatial_rules import (
     tick,
 )
 from trl_suite.tasks.components.trace import Trace, follow
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Outcome, conclude
-from trl_suite.tasks.terms import Term, give
+from trl_suite.tasks.task import CONTROL_TIMESTEP
+from trl_suite.tasks.terms import Outcome, Term, conclude, give
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_inline

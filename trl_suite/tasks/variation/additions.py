@@ -21,7 +21,7 @@ import numpy as np
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import Block
 from trl_suite.tasks.component import Component
-from trl_suite.tasks.task import Outcome
+from trl_suite.tasks.terms import Outcome
 from trl_suite.util import errors
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from trl_suite.tasks.component import MOTORS, Component, spawned
 from trl_suite.util import random
 
 if TYPE_CHECKING:
-    from trl_suite.tasks.task import Outcome, Task
+    from trl_suite.tasks.task import Task
+    from trl_suite.tasks.terms import Outcome
 
 
 class Motors(Component):

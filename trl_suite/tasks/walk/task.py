@@ -32,12 +32,11 @@ from trl_suite.tasks.task import (
     MOST_SUBSTEPS,
     SUBSTEPS,
     TERRAIN_LEVEL,
-    Outcome,
     Task,
     check_position_options,
-    conclude,
     drawn_seed,
 )
+from trl_suite.tasks.terms import Outcome, conclude
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option
