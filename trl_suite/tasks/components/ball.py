@@ -138,7 +138,7 @@ def dribble(
     """Writes the reward terms of a step, and whether the ball is at its goal.
 
     Args:
-      i: number of the simulation.
+      i: index of the simulation.
       seconds: duration of the step, s.
       goal: positions of the goals, (n, 3) m.
       physics, measurement: state and measurement of all simulations at the end of the step.
@@ -287,7 +287,7 @@ class Ball:
         """Places one ball, at rest, at a random displacement from a position on level ground.
 
         Args:
-          env_id: number of the simulation.
+          env_id: index of the simulation.
           place: the position, (2,) m.
           count: current control step of the episode.
           random: generator of the displacement and of the time until the ball is placed again.

@@ -178,7 +178,7 @@ def draw(
     draws of one do not depend on which others are varied.
 
     Args:
-      env_id: number of the simulation.
+      env_id: index of the simulation.
       config: the options.
       random: the random numbers.
       spatial: whether the character is three-dimensional.
