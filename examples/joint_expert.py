@@ -15,7 +15,7 @@ from expert import planner, wrap
 
 from trl_suite import policies
 from trl_suite.motion import quaternion
-from trl_suite.tasks.components.footstep_plan import PLAN_SIZE
+from trl_suite.tasks.common.footstep_plan import PLAN_SIZE
 from trl_suite.tasks.navigation.direct import DirectNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import CONTROLLER
 from trl_suite.tasks.navigation.plan_actions import STEP_LENGTH, plan_action_map

@@ -7,7 +7,7 @@ from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_single
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
-from trl_suite.tasks.components.plans import StraightPlans
+from trl_suite.tasks.common.plans import StraightPlans
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_LLC_Flat_Step-v0'

@@ -23,7 +23,7 @@ from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite, terrain
 from trl_suite.tasks import terms
-from trl_suite.tasks.components.plans import Plans, Pushes
+from trl_suite.tasks.common.plans import Plans, Pushes
 from trl_suite.vector import VectorEnvironment
 
 GENERAL, MIRRORED = 'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'

@@ -9,7 +9,7 @@ from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks import terms
-from trl_suite.tasks.components import rewards
+from trl_suite.tasks.common import rewards
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
 

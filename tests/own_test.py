@@ -22,7 +22,7 @@ from trl_suite import characters, cli, engine, gym, motion, policies, suite, ter
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import inspect, model_file
 from trl_suite.tasks import parts
-from trl_suite.tasks.components import description
+from trl_suite.tasks.common import description
 from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain.planar import generators
 from trl_suite.util import program

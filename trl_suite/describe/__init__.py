@@ -19,7 +19,7 @@ from trl_suite.describe import common, options
 from trl_suite.describe.differences import differences_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.components import description
+from trl_suite.tasks.common import description
 from trl_suite.util import tables
 from trl_suite.util.tables import Section, Table, escape, markdown, markdown_table, table
 

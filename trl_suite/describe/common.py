@@ -11,7 +11,7 @@ import numpy as np
 from trl_suite import characters, terrain
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.components.description import REWARD_WEIGHT, floats
+from trl_suite.tasks.common.description import REWARD_WEIGHT, floats
 from trl_suite.util.tables import Section, Table, section
 
 

@@ -18,8 +18,8 @@ from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.kinematics.spatial_reference import mean_targets
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.components.reflection import action_reflection
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.reflection import action_reflection
+from trl_suite.tasks.common.spatial_rules import (
     _DIGITS,
     ACTION_SCALE,
     HEIGHT_MAP,

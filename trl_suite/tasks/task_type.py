@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.components import description
-from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.common import description
+from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.task import Task
 from trl_suite.util.options import Config
 from trl_suite.util.tables import Section

@@ -1,8 +1,8 @@
 """Tasks that walk along planned footsteps."""
 
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.components import differences
-from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.common import differences
+from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.footsteps import description
 from trl_suite.tasks.footsteps.planar import PlanarFootsteps, PlanarFootstepsConfig
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite.tasks.components import description
-from trl_suite.tasks.components.description import span
+from trl_suite.tasks.common import description
+from trl_suite.tasks.common.description import span
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, section
 

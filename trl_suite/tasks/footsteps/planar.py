@@ -18,8 +18,8 @@ from trl_suite.engine import World
 from trl_suite.kinematics.planar import breaks_down, has_fallen, look
 from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
-from trl_suite.tasks.components import rewards
-from trl_suite.tasks.components.footstep_plan import (
+from trl_suite.tasks.common import rewards
+from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
     SOLE,
@@ -27,7 +27,7 @@ from trl_suite.tasks.components.footstep_plan import (
     STANCE_COLOUR,
     SWING_COLOUR,
 )
-from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
+from trl_suite.tasks.common.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.imitation import planar as imitation
 from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, drawn_seed

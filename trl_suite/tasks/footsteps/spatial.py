@@ -18,9 +18,9 @@ from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement
 from trl_suite.kinematics.spatial_reference import SpatialReference
 from trl_suite.motion import FootstepLibrary, quaternion, step_features
-from trl_suite.tasks.components.comparison import comparison
-from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
-from trl_suite.tasks.components.footstep_plan import (
+from trl_suite.tasks.common.comparison import comparison
+from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
+from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     LEFT,
     PLAN,
@@ -29,8 +29,8 @@ from trl_suite.tasks.components.footstep_plan import (
     footstep_plan,
     plan_markers,
 )
-from trl_suite.tasks.components.goals import GOAL, GOAL_COLOUR, flag
-from trl_suite.tasks.components.plans import (
+from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
+from trl_suite.tasks.common.plans import (
     FOOTSTEP_SCALE,
     MAX_LANDING_ERROR,
     Plans,

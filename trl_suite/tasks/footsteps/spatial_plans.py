@@ -7,9 +7,9 @@ import numpy as np
 from trl_suite.arenas import SpatialArena
 from trl_suite.kinematics.spatial import SpatialMeasurement
 from trl_suite.motion import quaternion
-from trl_suite.tasks.components.footstep_plan import SIDE, FootstepPlan
-from trl_suite.tasks.components.plans import ROOT_TURN_LIMIT, Plans
-from trl_suite.tasks.components.spatial_rules import Clock
+from trl_suite.tasks.common.footstep_plan import SIDE, FootstepPlan
+from trl_suite.tasks.common.plans import ROOT_TURN_LIMIT, Plans
+from trl_suite.tasks.common.spatial_rules import Clock
 from trl_suite.tasks.footsteps.spatial_rules import FootstepState
 
 NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading

@@ -9,18 +9,18 @@ import numpy as np
 
 from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_reference import feature, moment
-from trl_suite.tasks.components.comparison import (
+from trl_suite.tasks.common.comparison import (
     Comparison,
     com_error,
     motion_errors,
 )
-from trl_suite.tasks.components.footstep_plan import (
+from trl_suite.tasks.common.footstep_plan import (
     FootstepPlan,
     observe_plan,
     update_stance,
 )
-from trl_suite.tasks.components.rewards import HEADING_WEIGHT, STEP_TERMS
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.rewards import HEADING_WEIGHT, STEP_TERMS
+from trl_suite.tasks.common.spatial_rules import (
     Clock,
     Travel,
     View,

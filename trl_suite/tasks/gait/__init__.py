@@ -1,7 +1,7 @@
 """The TerrainRL family: actions set the parameters of a gait state machine."""
 
-from trl_suite.tasks.components import differences
-from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.common import differences
+from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.gait.description import GAIT
 from trl_suite.tasks.gait.task import GaitConfig, GaitTask
 from trl_suite.tasks.task_type import TaskType

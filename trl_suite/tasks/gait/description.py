@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.tasks.components import description
-from trl_suite.tasks.components.description import floats
+from trl_suite.tasks.common import description
+from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
 from trl_suite.tasks.task_type import Description

@@ -1,8 +1,8 @@
 """Tasks that track a motion clip."""
 
 from trl_suite.motion import Clip
-from trl_suite.tasks.components import differences
-from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.common import differences
+from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.imitation.description import IMITATION
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.tasks.imitation.spatial import SpatialImitation, SpatialImitationConfig

@@ -24,9 +24,9 @@ from trl_suite.kinematics.planar import PlanarBodyData, breaks_down, has_fallen,
 from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import ClipTable, Reference, feature
 from trl_suite.motion import Clip
-from trl_suite.tasks.components import rewards
-from trl_suite.tasks.components.footstep_plan import CONTACT
-from trl_suite.tasks.components.rewards import COM_ERROR_FACTOR
+from trl_suite.tasks.common import rewards
+from trl_suite.tasks.common.footstep_plan import CONTACT
+from trl_suite.tasks.common.rewards import COM_ERROR_FACTOR
 from trl_suite.tasks.task import (
     ACTION_OFFSETS,
     CONTROL_TIMESTEP,

@@ -18,16 +18,16 @@ from trl_suite.kinematics.blocks import Block
 from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, look, polar
 from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
 from trl_suite.motion import Clip, quaternion
-from trl_suite.tasks.components import rewards
-from trl_suite.tasks.components.comparison import (
+from trl_suite.tasks.common import rewards
+from trl_suite.tasks.common.comparison import (
     Comparison,
     com_error,
     comparison,
     effector_error,
     motion_errors,
 )
-from trl_suite.tasks.components.goals import GOAL
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.goals import GOAL
+from trl_suite.tasks.common.spatial_rules import (
     Clock,
     Travel,
     View,

@@ -4,9 +4,9 @@ from typing import Any
 
 from trl_suite import motion
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.components import differences
-from trl_suite.tasks.components.ball import Ball
-from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.common import differences
+from trl_suite.tasks.common.ball import Ball
+from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.navigation import description
 from trl_suite.tasks.navigation.direct import (
     DirectConfig,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from trl_suite.tasks.components import ball, description, spatial_description
-from trl_suite.tasks.components.description import floats
+from trl_suite.tasks.common import ball, description, spatial_description
+from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
 from trl_suite.tasks.navigation import direct, hierarchical_rules
 from trl_suite.tasks.task_type import Description

@@ -19,7 +19,7 @@ from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_reference import SpatialReference, moment
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.components.ball import (
+from trl_suite.tasks.common.ball import (
     BALL,
     BALL_GOAL,
     SPEED,
@@ -32,18 +32,18 @@ from trl_suite.tasks.components.ball import (
     remember,
     soccer_terms,
 )
-from trl_suite.tasks.components.comparison import (
+from trl_suite.tasks.common.comparison import (
     Comparison,
     com_error,
     comparison,
     effector_error,
     motion_errors,
 )
-from trl_suite.tasks.components.goal_drawer import GoalDrawer
-from trl_suite.tasks.components.goals import GOAL, Goals, flag, goals
-from trl_suite.tasks.components.plans import Plans
-from trl_suite.tasks.components.rewards import tracking_terms
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.goal_drawer import GoalDrawer
+from trl_suite.tasks.common.goals import GOAL, Goals, flag, goals
+from trl_suite.tasks.common.plans import Plans
+from trl_suite.tasks.common.rewards import tracking_terms
+from trl_suite.tasks.common.spatial_rules import (
     HEIGHT_MAP,
     Clock,
     Travel,
@@ -54,7 +54,7 @@ from trl_suite.tasks.components.spatial_rules import (
     publish,
     tick,
 )
-from trl_suite.tasks.components.trace import Trace, follow, trace, trace_markers
+from trl_suite.tasks.common.trace import Trace, follow, trace, trace_markers
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.imitation.spatial import check_cycle, clip_action, cycle_poses, pose_of_clip
 from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask

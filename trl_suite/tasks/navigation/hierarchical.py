@@ -19,7 +19,7 @@ from trl_suite.engine import World
 from trl_suite.kinematics.blocks import Block, columns, layout
 from trl_suite.kinematics.spatial_figure import body_blocks
 from trl_suite.motion import FootstepLibrary
-from trl_suite.tasks.components.ball import (
+from trl_suite.tasks.common.ball import (
     AT_GOAL,
     BALL,
     BALL_GOAL,
@@ -28,22 +28,22 @@ from trl_suite.tasks.components.ball import (
     no_ball,
     soccer_terms,
 )
-from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
-from trl_suite.tasks.components.footstep_plan import (
+from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
+from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
     check_two_feet,
     footstep_plan,
     plan_markers,
 )
-from trl_suite.tasks.components.goal_drawer import GoalDrawer
-from trl_suite.tasks.components.goals import GOAL, flag, goals
-from trl_suite.tasks.components.plans import Plans
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.goal_drawer import GoalDrawer
+from trl_suite.tasks.common.goals import GOAL, flag, goals
+from trl_suite.tasks.common.plans import Plans
+from trl_suite.tasks.common.spatial_rules import (
     PHASE,
     TERRAIN_MAPS,
 )
-from trl_suite.tasks.components.trace import trace, trace_markers
+from trl_suite.tasks.common.trace import trace, trace_markers
 from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,

@@ -10,19 +10,19 @@ import numpy as np
 from trl_suite.kinematics.blocks import HEIGHTS, Block, Reflection
 from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
 from trl_suite.kinematics.spatial_figure import LINES
-from trl_suite.tasks.components.ball import (
+from trl_suite.tasks.common.ball import (
     BallRules,
     dribble,
     observe_ball,
     remember,
 )
-from trl_suite.tasks.components.footstep_plan import (
+from trl_suite.tasks.common.footstep_plan import (
     FootstepPlan,
     observe_plan,
     update_stance,
 )
-from trl_suite.tasks.components.goals import Goals
-from trl_suite.tasks.components.spatial_rules import (
+from trl_suite.tasks.common.goals import Goals
+from trl_suite.tasks.common.spatial_rules import (
     Clock,
     Travel,
     look_and_travel,
@@ -30,7 +30,7 @@ from trl_suite.tasks.components.spatial_rules import (
     observe_phase,
     tick,
 )
-from trl_suite.tasks.components.trace import Trace, follow
+from trl_suite.tasks.common.trace import Trace, follow
 from trl_suite.tasks.task import CONTROL_TIMESTEP
 from trl_suite.tasks.terms import Outcome, Term, conclude, give
 from trl_suite.terrain.spatial import windows as spatial_ground

@@ -23,7 +23,7 @@ from trl_suite.kinematics.spatial import SpatialBodyData
 from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, observe_body
+from trl_suite.tasks.common.spatial_rules import HEIGHT_MAP, observe_body
 from trl_suite.tasks.imitation.planar import VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.spatial_task import maps
 from trl_suite.tasks.task import (

@@ -16,7 +16,7 @@ from trl_suite.arenas import SpatialArena
 from trl_suite.engine import World
 from trl_suite.kinematics.blocks import SPIN, VECTOR, Block, Noise, signs
 from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
-from trl_suite.tasks.components.goals import GOAL, GOAL_COLOUR
+from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR
 from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, random_displacement
 from trl_suite.tasks.terms import Outcome, Term, give, terms_data
 from trl_suite.terrain import PRESETS3D

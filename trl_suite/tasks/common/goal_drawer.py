@@ -6,9 +6,9 @@ import numpy as np
 
 from trl_suite.arenas import SpatialArena
 from trl_suite.engine import World
-from trl_suite.tasks.components.ball import GOAL_AWAY, Ball
-from trl_suite.tasks.components.goals import Goals, set_goal
-from trl_suite.tasks.components.spatial_rules import Clock
+from trl_suite.tasks.common.ball import GOAL_AWAY, Ball
+from trl_suite.tasks.common.goals import Goals, set_goal
+from trl_suite.tasks.common.spatial_rules import Clock
 from trl_suite.tasks.task import random_displacement
 
 

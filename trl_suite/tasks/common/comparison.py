@@ -11,7 +11,7 @@ from trl_suite.characters import Character
 from trl_suite.kinematics.blocks import by_name
 from trl_suite.kinematics.spatial import SpatialMeasurement
 from trl_suite.kinematics.spatial_reference import SpatialReference, TrackTable, feature
-from trl_suite.tasks.components.rewards import COM_ERROR_FACTOR
+from trl_suite.tasks.common.rewards import COM_ERROR_FACTOR
 from trl_suite.tasks.terms import Term, terms_data
 from trl_suite.util.compiled import compiled
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from trl_suite import terrain
-from trl_suite.tasks.components import ball, goals
-from trl_suite.tasks.components.description import span
+from trl_suite.tasks.common import ball, goals
+from trl_suite.tasks.common.description import span
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
