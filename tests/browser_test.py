@@ -448,7 +448,7 @@ class ReplayTest(FolderTest):
             replays.Replay(environment, self.folder / 'goat.mp4')
         with self.assertRaisesRegex(ValueError, 'no reference clip to show as a ghost'):
             replays.Replay(environment, ghost=True)
-        with self.assertRaisesRegex(ValueError, 'fps is 0; expected a positive number'):
+        with self.assertRaisesRegex(ValueError, 'fps is 0; expected a number above 0'):
             replays.Replay(environment, fps=0)
         with (
             self.assertRaisesRegex(ValueError, 'the replay has no states'),

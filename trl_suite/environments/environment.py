@@ -216,7 +216,7 @@ class Environment(composer.Environment):
         return self._observe()
 
     def _observe(self) -> dict[str, np.ndarray]:
-        row, found = self._task.observation[0].copy(), {}
+        row, found = self._task.seen.observation[0].copy(), {}
         if not self._flat_observation:
             found = {name: row[part] for name, part in self.blocks.items()}
         if self._has_own_observables:

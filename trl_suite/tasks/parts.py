@@ -57,7 +57,7 @@ def upright(task: Any) -> np.ndarray:
 
 
 def effort(task: Any) -> np.ndarray:
-    """Mean square of the last action, in [0, 1], (n,); of a composed task."""
+    """Mean square of the last action, in [0, 1], (n,); for the functions of `Additions`."""
     return np.add.reduce(task.action**2, axis=1) / task.action.shape[1]
 
 

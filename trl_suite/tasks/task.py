@@ -102,6 +102,7 @@ class Task(composer.Task):
     info_arrays: dict[str, Any]
     CONFIG: Any = None  # options: a subclass of `Config`, or a dict of them by `spec.spatial`
     fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
+    steps_vary = False  # whether the duration of steps varies, so that it is not 1/30 s
     in_parts = True  # whether several threads may call the task, each for some simulations
     step_in_parts = True  # the same, without components
     _begun = False  # whether composer has reset the task, and no step has followed yet

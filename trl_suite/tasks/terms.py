@@ -1,7 +1,7 @@
 """The outcome of a step, and reward terms as data, with the compiled functions that write them.
 
 A task declares its terms once, beside the compiled function that computes them. That function reads
-weights and scales by name, as in `score(i, error, rules.terms.pose, rules.outcome)`; indices, `info`
+weights and scales by name, as in `score(i, error, data.terms.pose, data.outcome)`; indices, `info`
 and the tables of `trl-suite info` and of the pages derive from the declaration.
 """
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from trl_suite.tasks.terms import Term
+from typing import Any
+
+from trl_suite.tasks.terms import Outcome, Term, score
+from trl_suite.util.compiled import compiled
 
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
@@ -51,3 +54,16 @@ STEP_TERMS = tracking_terms(
     end_effector=(0.2 / 1.05, 5.0), com=(0.1 / 1.05, 10.0), root=(0.1 / 1.05, 10.0),
 )  # fmt: skip
 HEADING_WEIGHT = 0.1 / 1.05  # of the term heading, which footstep controllers have as well
+
+
+@compiled
+def score_tracking(
+    i: int, pose: float, velocity: float, end_effector: float, com: float, height: float, terms: Any,
+    outcome: Outcome,
+) -> None:  # fmt: skip
+    """Writes the terms of `tracking_terms` from their errors."""
+    score(i, pose, terms.pose, outcome)
+    score(i, velocity, terms.velocity, outcome)
+    score(i, end_effector, terms.end_effector, outcome)
+    score(i, com, terms.com, outcome)
+    score(i, height, terms.root, outcome)

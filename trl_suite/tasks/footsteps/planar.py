@@ -28,10 +28,11 @@ from trl_suite.tasks.common.footstep_plan import (
     SWING_COLOUR,
 )
 from trl_suite.tasks.common.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
+from trl_suite.tasks.common.rewards import score_tracking
 from trl_suite.tasks.imitation import planar as imitation
 from trl_suite.tasks.imitation.planar import ImitationData, PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, drawn_seed
-from trl_suite.tasks.terms import Term, begin, conclude, give, score
+from trl_suite.tasks.terms import Term, begin, conclude, give
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option
@@ -171,11 +172,7 @@ def compare(i: int, data: ImitationData, plan: Plan, options: Options) -> None:
         z = plan.landing[i, 0, 2] - body.physics.xpos[i, foot, 2] + raised
         end_effector += options.footstep_scale * (x * x + z * z)
     terms, outcome = data.terms, data.outcome
-    score(i, pose, terms.pose, outcome)
-    score(i, velocity, terms.velocity, outcome)
-    score(i, end_effector, terms.end_effector, outcome)
-    score(i, com, terms.com, outcome)
-    score(i, height, terms.root, outcome)
+    score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
     give(i, 1.0 if measurement.facing[i] > 0.0 else 0.0, terms.heading, outcome)
 
 

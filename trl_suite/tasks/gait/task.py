@@ -128,6 +128,7 @@ class GaitTask(Task):
         """
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
+        self.steps_vary = interface == 'parameters'
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
         parameters = load(character.spec.name, config.base_actions)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)

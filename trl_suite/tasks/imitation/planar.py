@@ -26,7 +26,7 @@ from trl_suite.kinematics.planar_reference import ClipTable, Reference, feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.common import rewards
 from trl_suite.tasks.common.footstep_plan import CONTACT
-from trl_suite.tasks.common.rewards import COM_ERROR_FACTOR
+from trl_suite.tasks.common.rewards import COM_ERROR_FACTOR, score_tracking
 from trl_suite.tasks.task import (
     ACTION_OFFSETS,
     CONTROL_TIMESTEP,
@@ -42,7 +42,7 @@ from trl_suite.tasks.task import (
     drawn_seed,
     start_phases,
 )
-from trl_suite.tasks.terms import Outcome, begin, conclude, score, terms_data, wrapped
+from trl_suite.tasks.terms import Outcome, begin, conclude, terms_data, wrapped
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option
@@ -144,11 +144,7 @@ def compare(i: int, data: ImitationData) -> None:
     """Writes the reward terms."""
     pose, velocity, end_effector, com, height = errors(i, data)
     terms, outcome = data.terms, data.outcome
-    score(i, pose, terms.pose, outcome)
-    score(i, velocity, terms.velocity, outcome)
-    score(i, end_effector, terms.end_effector, outcome)
-    score(i, com, terms.com, outcome)
-    score(i, height, terms.root, outcome)
+    score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
 
 
 @compiled

@@ -27,6 +27,7 @@ from trl_suite.tasks.common.comparison import (
     motion_errors,
 )
 from trl_suite.tasks.common.goals import GOAL
+from trl_suite.tasks.common.rewards import score_tracking
 from trl_suite.tasks.common.spatial_rules import (
     Clock,
     Travel,
@@ -38,7 +39,7 @@ from trl_suite.tasks.common.spatial_rules import (
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
 from trl_suite.tasks.task import drawn_seed
-from trl_suite.tasks.terms import Outcome, conclude, score
+from trl_suite.tasks.terms import Outcome, conclude
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option
@@ -95,11 +96,7 @@ def compare(i: int, data: ImitationData) -> None:
     end_effector = effector_error(i, row, fraction, comparison, measurement)
     com = com_error(i, row, fraction, 0.0, comparison, measurement)
     terms, outcome = comparison.terms, data.outcome
-    score(i, pose, terms.pose, outcome)
-    score(i, velocity, terms.velocity, outcome)
-    score(i, end_effector, terms.end_effector, outcome)
-    score(i, com, terms.com, outcome)
-    score(i, height, terms.root, outcome)
+    score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
 
 
 @compiled

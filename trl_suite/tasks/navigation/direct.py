@@ -42,7 +42,7 @@ from trl_suite.tasks.common.comparison import (
 from trl_suite.tasks.common.goal_drawer import GoalDrawer
 from trl_suite.tasks.common.goals import GOAL, Goals, flag, goals
 from trl_suite.tasks.common.plans import Plans
-from trl_suite.tasks.common.rewards import tracking_terms
+from trl_suite.tasks.common.rewards import score_tracking, tracking_terms
 from trl_suite.tasks.common.spatial_rules import (
     HEIGHT_MAP,
     Clock,
@@ -185,11 +185,7 @@ def compare(i: int, data: DirectData) -> None:
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
     terms, outcome = comparison.terms, data.outcome
-    score(i, pose, terms.pose, outcome)
-    score(i, velocity, terms.velocity, outcome)
-    score(i, end_effector, terms.end_effector, outcome)
-    score(i, com, terms.com, outcome)
-    score(i, height, terms.root, outcome)
+    score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
     give(i, facing(off), terms.heading, outcome)
     score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
     along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y

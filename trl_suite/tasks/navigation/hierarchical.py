@@ -186,31 +186,34 @@ class HierarchicalNavigation(SpatialTask):
             character, arena, steps, typical_poses(steps, self._first), config,
             period=2 * steps.duration,
         )  # fmt: skip
-        self._seen = *self.figure.blocks, PHASE, CONTACT, PLAN  # by the footstep controller
         self.controller = footstep_controller.load(config.controller)
-        self.controller.check(character.spec, layout(self._seen), self.joint_map)
+        policy = self.controller.policy
+        self._controller_blocks = tuple(
+            block.observed_if(policy is None or block.name in dict(policy.blocks))
+            for block in (*self.figure.blocks, PHASE, CONTACT, PLAN)
+        )
+        self.controller.check(character.spec, layout(self._controller_blocks), self.joint_map)
         # A custom function is called on one thread, for all simulations together.
-        self.in_parts = self.controller.policy is not None
+        self.in_parts = policy is not None
         self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
             (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
         self._goal_drawer = GoalDrawer(arena, ball, 'far', config.goal_distance)
-        by_plan = self.interface == 'plan'
+        self.steps_vary = by_plan = self.interface == 'plan'
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         self.action_map = plan_action_map(self.step_length, None if by_plan else self.joint_map)
-        terrain, pose, velocity = body_blocks(character, 'height' in config.terrain_observation)
+        terrain, *body = body_blocks(character, 'height' in config.terrain_observation)
         controller = Block(
-            'low_level', sum(block.size for block in self._seen), '',
+            'low_level', sum(block.size for block in self._controller_blocks), '',
             'observation of the footstep controller', 'the footstep controller has its own observation',
         )  # fmt: skip
         self.observed = (
             terrain,
             SURFACE.observed_if('velocity' in config.terrain_observation),
-            pose,
-            velocity,
+            *body,
             BALL_GOAL if ball else GOAL,
             BALL.observed_if(ball is not None),
             controller.observed_if(not by_plan),
@@ -247,7 +250,8 @@ class HierarchicalNavigation(SpatialTask):
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         seen = ControllerData(
-            columns(self._seen), np.zeros((n, sum(block.size for block in self._seen)))
+            columns(self._controller_blocks),
+            np.zeros((n, sum(block.size for block in self._controller_blocks))),
         )
         self._controller_observation = seen.observation
         self._joint_action = np.zeros((n, len(self.joint_map)))

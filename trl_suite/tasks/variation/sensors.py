@@ -26,7 +26,6 @@ from trl_suite.util.random import random, standard_normal
 
 TERRAIN_DROPOUT = (0.01, 0.05, 0.15)  # of the presets
 MOST_DELAY = 1000  # steps
-FRESH, NEXT, AGAIN = range(3)  # a new episode; the next step; the same state once more
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -269,16 +268,15 @@ def observe(i: int, rules: SensorRules) -> None:
 
 
 @compiled
-def sense_all(env_ids: np.ndarray, kind: int, rules: SensorRules) -> None:
-    """Writes what is observed in simulations: `FRESH`, `NEXT` or `AGAIN`. Takes a pack."""
+def sense_all(env_ids: np.ndarray, fresh: bool, rules: SensorRules) -> None:
+    """Writes what is observed after a step, or if `fresh` in new episodes. Takes a pack."""
     depth = rules.state.history.shape[1]
     for i in env_ids:
-        if kind == FRESH:
+        if fresh:
             begin(i, rules)
-        elif kind == NEXT and depth > 0:
+        elif depth > 0:
             rules.state.head[i] = (rules.state.head[i] + 1) % depth
-        if kind != AGAIN:
-            draw(i, rules)
+        draw(i, rules)
         observe(i, rules)
 
 
@@ -302,9 +300,7 @@ class Sensors(Component):
         return {'sensors': (str(self._config.changed), self._config)}
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
-        # Tasks whose steps last longer than 1/30 s have a callback within steps.
-        long_steps = hasattr(self.task, 'watch')
-        data = rules(self._config, self._observed, outcome.observation, long_steps)
+        data = rules(self._config, self._observed, outcome.observation, self.task.steps_vary)
         self._pack, self._state = packed(data), data.state
         self.saved = (data.state,)
         self.info_arrays = {'clean_observation': outcome.observation}
@@ -315,4 +311,4 @@ class Sensors(Component):
             seeded(env_id, spawned(seed, SENSORS), self._state.stream)
 
     def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
-        sense_all(env_ids, FRESH if fresh else NEXT, self._pack)
+        sense_all(env_ids, fresh, self._pack)
