@@ -238,10 +238,10 @@ class InfoTest(CommandTest):
         self.assertIn('42 kg', out)
         self.assertRegex(out, r'\n  heading +0\.09524 ')
         self.assertRegex(
-            out, r'\n  end_effector +0\.1905 +5  m\^2 .*from the root .*, sum over end effectors\n'
+            out, r'\n  end_effector +0\.1905 +5 +m\^2 .*from the root .*, sum over end effectors\n'
         )
         self.assertRegex(
-            out, r'\n  com +0\.09524 +10  m\^2/s\^2  0\.1 times the squared difference'
+            out, r'\n  com +0\.09524 +10 +m\^2/s\^2 +0\.1 times the squared difference'
         )
         self.assertIn('one of root, torso touches the ground', out)
         self.assertIn('steps 0.5 m long, feet 0.15 m apart', out)
