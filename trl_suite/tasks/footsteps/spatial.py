@@ -156,7 +156,7 @@ class SpatialFootsteps(TrackingTask):
         data = FootstepData(
             body=self.figure.data,
             outcome=self.outcome,
-            seen=view,
+            given=view,
             clock=self.clock,
             travel=self.travel,
             period=self.period,

@@ -81,7 +81,7 @@ class FootstepData(NamedTuple):
 
     body: SpatialBodyData
     outcome: Outcome
-    seen: View
+    given: View
     clock: Clock
     travel: Travel
     period: float
@@ -174,7 +174,7 @@ def compare(i: int, data: FootstepData) -> None:
 @compiled
 def observe(i: int, data: FootstepData) -> None:
     """Writes the observation."""
-    body, columns, full = data.body, data.seen.columns, data.seen.full
+    body, columns, full = data.body, data.given.columns, data.given.full
     measurement = body.measurement
     observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
@@ -183,7 +183,7 @@ def observe(i: int, data: FootstepData) -> None:
         x = data.state.goal[i, 0] - measurement.root[i, 0]
         y = data.state.goal[i, 1] - measurement.root[i, 1]
         full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.seen, data.outcome)
+    publish(i, data.given, data.outcome)
 
 
 # Loops over simulations; they take packs.

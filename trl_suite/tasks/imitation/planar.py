@@ -316,8 +316,8 @@ class PlanarImitation(Task):
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
-        seen = getattr(config, 'reference_observation', False)
-        own = motion_blocks(len(muscles), len(character.spec.links), seen)
+        reference = getattr(config, 'reference_observation', False)
+        own = motion_blocks(len(muscles), len(character.spec.links), reference)
         self.observed = *self.figure.blocks, *own, *self.EXTRAS
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
         self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])

@@ -55,7 +55,7 @@ class ImitationData(NamedTuple):
 
     body: SpatialBodyData
     outcome: Outcome
-    seen: View
+    given: View
     clock: Clock
     travel: Travel
     period: float
@@ -102,7 +102,7 @@ def compare(i: int, data: ImitationData) -> None:
 @compiled
 def observe(i: int, data: ImitationData) -> None:
     """Writes the observation."""
-    body, columns, full = data.body, data.seen.columns, data.seen.full
+    body, columns, full = data.body, data.given.columns, data.given.full
     observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
     if columns.reference >= 0:
@@ -114,7 +114,7 @@ def observe(i: int, data: ImitationData) -> None:
             full[i, columns.reference + 1 + k] = value
     aside = data.travel.origin[i, 1] - body.measurement.root[i, 1]
     full[i, columns.goal], full[i, columns.goal + 1] = polar(i, GOAL_AHEAD, aside, body.measurement)
-    publish(i, data.seen, data.outcome)
+    publish(i, data.given, data.outcome)
 
 
 def motion_blocks(links: int, reference: bool) -> tuple[Block, ...]:
@@ -196,11 +196,11 @@ class SpatialImitation(TrackingTask):
           ValueError: incompatible options, or a clip that does not fit the character.
         """
         check_cycle(clip)
-        self.clip, seen = clip, config.reference_observation
+        self.clip, reference = clip, config.reference_observation
         super().__init__(
             character, arena, clip, cycle_poses(clip), config, period=clip.duration,
-            actuation_model=actuation_model, phase=not seen,
-            extras=motion_blocks(len(character.spec.links), seen),
+            actuation_model=actuation_model, phase=not reference,
+            extras=motion_blocks(len(character.spec.links), reference),
         )  # fmt: skip
 
     def bind(self, world: World) -> None:
@@ -210,7 +210,7 @@ class SpatialImitation(TrackingTask):
             ImitationData(
                 body=self.figure.data,
                 outcome=self.outcome,
-                seen=view,
+                given=view,
                 clock=self.clock,
                 travel=self.travel,
                 period=self.period,

@@ -108,7 +108,7 @@ class DirectData(NamedTuple):
 
     body: SpatialBodyData
     outcome: Outcome
-    seen: View
+    given: View
     clock: Clock
     travel: Travel
     period: float
@@ -195,7 +195,7 @@ def compare(i: int, data: DirectData) -> None:
 @compiled
 def observe(i: int, data: DirectData) -> None:
     """Writes the observation."""
-    body, columns, full = data.body, data.seen.columns, data.seen.full
+    body, columns, full = data.body, data.given.columns, data.given.full
     measurement, place = body.measurement, data.goals.place
     observe_body(i, columns, body, full)
     observe_phase(i, columns, data.clock, full)
@@ -204,7 +204,7 @@ def observe(i: int, data: DirectData) -> None:
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
         full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.seen, data.outcome)
+    publish(i, data.given, data.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -333,7 +333,7 @@ class DirectNavigation(TrackingTask):
         data = DirectData(
             body=self.figure.data,
             outcome=self.outcome,
-            seen=view,
+            given=view,
             clock=self.clock,
             travel=self.travel,
             period=self.period,

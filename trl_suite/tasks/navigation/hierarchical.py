@@ -249,11 +249,11 @@ class HierarchicalNavigation(SpatialTask):
             balls = self.ball.rules(float(self.config.target_speed), self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        seen = ControllerData(
+        observed = ControllerData(
             columns(self._controller_blocks),
             np.zeros((n, sum(block.size for block in self._controller_blocks))),
         )
-        self._controller_observation = seen.observation
+        self._controller_observation = observed.observation
         self._joint_action = np.zeros((n, len(self.joint_map)))
         self._pack = packed(
             PlanningData(
@@ -262,7 +262,7 @@ class HierarchicalNavigation(SpatialTask):
                 clock=self.clock,
                 travel=self.travel,
                 period=self.period,
-                controller=seen,
+                controller=observed,
                 plan=self.plan,
                 goals=self.goals,
                 state=self.state,
