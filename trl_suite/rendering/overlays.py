@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from trl_suite.motion import quaternion
-from trl_suite.tasks.task import Marker
+from trl_suite.tasks.task import Marker, Task
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 Overlay = Callable[[Any, Any], None]
@@ -25,7 +25,7 @@ GHOST_BEHIND = 0.7  # m; distance of the ghost behind the character, as seen by 
 def of_task(task: Any, with_ghost: bool = False) -> list[Overlay]:
     """Returns the overlays of a task: its markers, and optionally the reference pose."""
     drawn = [ghost(task)] if with_ghost else []
-    return [*drawn, markers(task)]
+    return [*drawn, markers(task)] if isinstance(task, Task) else drawn
 
 
 def ghost(task: Any) -> Overlay:
