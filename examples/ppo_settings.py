@@ -393,7 +393,7 @@ GUIDED = {
     'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
     'evaluation_episodes': 32,
 }  # fmt: skip
-# With more data and a larger network imitation alone comes close to its expert (findings).
+# With more data and a larger network imitation alone comes close to its expert.
 IMITATING = {**GUIDED, 'hidden': (512, 256), 'cloning_epochs': 20}
 AMONG_BLOCKS = {**IMITATING, 'samples': 3.6e5, 'cloned': 3.6e5, 'evaluation_episodes': 64}
 AMONG_PILLARS = {**AMONG_BLOCKS, 'samples': 3e5, 'cloned': 3e5, 'clonings': 5}

@@ -15,7 +15,7 @@ shape, with other weights in its first layer and other biases.
 The score of a controller is the mean landing error in all conditions of `evaluate_footsteps.py`; an
 error counts at most `MISS`, and as `MISS` in every step after a fall. All candidates of a generation
 walk in the same episodes, and each generation has other ones. Heading errors do not count, nor do falls
-after `SECONDS`: see docs/findings.md. Needs `pip install 'trl_suite[tune]'`.
+after `SECONDS`, and both increase. Needs `pip install 'trl_suite[tune]'`.
 """
 
 from __future__ import annotations
