@@ -33,19 +33,17 @@ PLANS = (  # tag, title, text
     (
         'hierarchical',
         '## Planning footsteps',
-        'Measured by `examples/evaluate_plans.py` in whole episodes of 200 s, seed 0, with the scripted '
-        'and the reference policy, and of some with the expert that was imitated. *Reward*: normalised '
-        'cumulative reward, 0 after a fall. *Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: '
-        'median distance along the trail, m. *Ball at goal*: share of the time.',
+        'By `examples/evaluate_plans.py`: episodes of 200 s, seed 0, with the scripted and the reference policy, '
+        'and the expert that was imitated. *Reward*: normalised, 0 after a fall. *Speed*: towards the goal '
+        '(soccer: of the ball), m/s. *Trail*: median distance along it, m. *Ball at goal*: share of the time.',
     ),
     (
         'flat_control',
         '## The same tasks without hierarchy',
-        'Measured by the same program in episodes of the same length. The policies imitate planned '
-        'footsteps and the controller that tracks them; results of policies that PPO trained: '
-        '[findings](findings.md#without-hierarchy). The reward includes imitation of the clip. Goals '
-        'are reached within 0.5 m instead of 1 m, and on the trail they are one segment of 2 m ahead '
-        'instead of up to ten segments; in soccer, speed is towards the ball.',
+        'The same program and episodes. The policies imitate planned footsteps and the controller that tracks '
+        'them; with PPO alone: [comparison with the papers](findings.md#without-hierarchy). The reward includes '
+        'imitation of the clip. Goals are reached within 0.5 m instead of 1 m, and on the trail they are one '
+        'segment of 2 m ahead instead of up to ten; in soccer, speed is towards the ball.',
     ),
 )
 PLAN_COLUMNS = (
@@ -261,30 +259,22 @@ def plan_rows(tag: str) -> list[list[str]]:
 
 def page(entries: dict[str, dict[str, Any]]) -> str:
     runs = [run for entry in entries.values() for run in entry['runs']]
-    machines = ', '.join(sorted({run['machine'].partition(';')[0] for run in runs}))
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
         '# Results',
-        f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments. This page is '
-        f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
-        'run of `examples/ppo.py`, or for gait environments of `examples/search_gaits.py`, '
-        '`examples/learn_gaits.py` or `examples/refine_gaits.py`, with the settings in its JSON file; '
-        '`examples/train_all.py` repeats them, except for what a note under the table of gaits says. Of several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
-        '[comparison with the papers](findings.md).',
-        f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes (gaits on '
-        'other terrains: see the column *episodes*) that were '
-        'used neither for training nor for the selection of a policy during training; the results '
-        'therefore differ from the learning curves. (Of several seeds, the best one was selected in these '
-        'episodes; all seeds are listed under *Actuation models*.) *Return* is divided by its maximum; the '
-        'reward is 0 after a fall. *Complete* is the share of episodes that lasted to the end (256 steps; '
-        'high-level environments 200 s), *distance* the mean in m, *minutes* the wall time of the run. '
-        '*Initial policy*: the policy from which training started, whose samples are not included; or the '
-        'policy that was imitated first, whose samples are included: `scripted` is the hand-written '
-        'policy, `expert` an [expert with a map](../examples/expert.py), `joint_expert` planned footsteps and the '
-        '[controller that tracks them](../examples/joint_expert.py). The page of an environment says '
-        'whether its policy was saved at the end of the imitation, or later. '
-        f'Machine: {machines}; one thread per run, with up to five runs and other work at the same time, '
-        'so that wall times are only a rough guide.',
+        f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments: '
+        '`suite.reference_policy(id)`. This page is written by `examples/results.py` from the '
+        f'{len(runs)} runs in `trained/`, which `examples/train_all.py` repeats. A `note` in the file of a run says '
+        'where it differs from the settings there. Claims of the papers: [comparison with the papers](findings.md).',
+        f'Policies are evaluated without noise, in {" or ".join(map(str, episodes))} episodes (gaits on other '
+        'terrains: column *episodes*) that are used neither in training nor to select a policy of the curve. Of '
+        'several seeds the best one in these episodes is shipped; all seeds: *Actuation models*. *Return* is '
+        'divided by its maximum; the reward is 0 after a fall. *Complete*: share of episodes that last to the '
+        'end (256 steps; planned footsteps 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
+        'thread of a shared machine. *Initial policy*: where training starts, its samples '
+        'not included; or what is imitated first, samples included: `scripted`, the hand-written policy; `expert`, an '
+        '[expert with a map](../examples/expert.py); `joint_expert`, planned footsteps and the '
+        '[controller that tracks them](../examples/joint_expert.py).',
         '## Environments with a policy, except gaits',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
@@ -298,9 +288,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '![Learning curves](learning_curves.png)',
         'Learning curves, evaluated without noise; faint: other seeds.',
         '## Actuation models',
-        'Means over seeds. The last columns are the samples after which the policy without noise first '
-        'reached 0.5, 0.8 and 0.9 of the maximum, averaged over the seeds that did (evaluated every '
-        '0.1 M samples).',
+        'Means over seeds, and the samples after which the policy first reaches 0.5, 0.8 and 0.9 of the maximum, '
+        'averaged over the seeds that do (evaluated every 0.1 M samples).',
         table(
             ('character, actuation', 'seeds', 'return', 'each', 'complete', 'to 0.5', 'to 0.8',
              'to 0.9'),
@@ -311,11 +300,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Gaits',
-            'Median and mean distance in m before a fall, of the trained policy and of the '
-            f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which are truncated after '
-            f'{terrainrl.STEP_LIMIT} cycles; the mean with its 95 % interval; speed in m/s. *Decisions*: with '
-            '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
-            '`examples/learn_gaits.py` and `examples/refine_gaits.py`, simulated cycles.',
+            'Median and mean distance in m before a fall, of the trained policy and of the default gait, in the same '
+            f'{train_all.GAIT_EPISODES} episodes, which are truncated after {terrainrl.STEP_LIMIT} cycles; speed in '
+            'm/s. *Decisions*: simulated cycles of training.',
             table(
                 (
                     'environment',
@@ -330,23 +317,15 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                 ),
                 rows,
             ),
-            'Runs that differ from the settings in their files:',
-            '\n'.join(
-                f'- `{id_}`: {run["note"]}'
-                for id_, entry in entries.items()
-                for run in entry['runs']
-                if 'note' in run
-            ),
         ]
     rows = shared_rows()
     if rows:
         parts += [
             '## Gaits on other terrains',
-            'Policies that are shipped for further environments, by `examples/share_gaits.py`. *Before*: '
-            'the mean of the policy that was replaced, or else of the default gait, in the same episodes. '
-            '*Preference*: number that is added to the value of the default gait. *Truncated*: share of '
-            f'the episodes that lasted {terrainrl.STEP_LIMIT} cycles; where it is high, the distance to a '
-            'fall is longer.',
+            'Policies that are shipped for further environments, by `examples/share_gaits.py`. *Before*: mean of the '
+            'policy that is replaced, or else of the default gait, in the same episodes. *Preference*: added to the '
+            f'value of the default gait. *Truncated*: share of episodes that last {terrainrl.STEP_LIMIT} cycles; '
+            'where it is high, the distance to a fall is longer.',
             table(
                 (
                     'environment',
@@ -366,38 +345,31 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Falls of gaits that other actions prevent',
-            'Measured by `examples/oracle_gaits.py`: the share of the falls of a policy that some action '
-            'prevents if it is taken one, two, ... five cycles before the end and the policy goes on from '
-            f'there: the character gets {oracle_gaits.PASSED:g} m beyond the place of the fall, or as far as '
-            f'{oracle_gaits.PASSED_CYCLES} of its mean cycles if they are shorter, within '
-            f'{oracle_gaits.MOST_CYCLES} cycles. *Base*: every base action (7 to 18 of them, depending on '
-            'the character; more tries prevent more falls); *random*: eight base actions with noise in all parameters; '
-            '*nudged*: no other action, but joint angles that are changed by 0.001 rad, eight times; '
-            '*any*: the share of falls that some action prevents, at any time. Where it is low, the gait '
-            'is the limit, or the view. Where base actions prevent more than nudges, the choice of the '
-            'action is; where they do not, falls depend on differences that the policy cannot observe.',
+            'By `examples/oracle_gaits.py`: the share of falls that some action prevents, taken for one cycle one, two, '
+            f'... five cycles before the end; the character then gets {oracle_gaits.PASSED:g} m beyond the place of '
+            f'the fall, or {oracle_gaits.PASSED_CYCLES} of its mean cycles if shorter, within '
+            f'{oracle_gaits.MOST_CYCLES} cycles. *Base*: every base action (7 to 18: more tries prevent more falls); *random*: eight base actions with noise; '
+            '*nudged*: joint angles changed by 0.001 rad, eight times; *any*: at any time. Where base actions prevent '
+            'more than nudges, the selection is the limit; else falls depend on what the policy cannot observe.',
             table(('environment', 'falls', 'base', 'random', 'nudged', 'any'), rows),
         ]
     rows = fall_rows()
     if rows:
         parts += [
             '## Falls of tracking policies that other actions prevent',
-            'Measured by `examples/oracle_falls.py`: the share of the falls of a policy that noise in its '
-            'actions prevents, if it begins 0.25, 0.5, 1 and 1.5 s before the end, ends at the time of '
-            'the fall, and is tried 32 times; under pushes a fall is prevented if the walker has not fallen '
-            '2 s later, else if the character gets beyond its place. By the standard deviation of the noise, in units of the '
-            'action: 0.001, which shows how many falls are a matter of chance; 0.15; and 0.5. Where noise '
-            'prevents a fall, neither the clip nor the torque limits are the reason of the fall.',
+            'By `examples/oracle_falls.py`: the share of falls that noise in the actions prevents in any of 32 tries, '
+            'if it begins 0.25, 0.5, 1 and 1.5 s before the end; by its standard deviation in units of the '
+            'action, of which 0.001 shows what is a matter of chance. Where noise prevents a fall, neither the '
+            'clip nor the torque limits are its reason.',
             table(('environment', 'falls', '0.001', '0.15', '0.5'), rows),
         ]
     rows = generalist_rows()
     if rows:
         parts += [
             '## One policy for all terrains',
-            'Policies of `examples/generalist.py` (`--policy generalist`): return, divided by the maximum, and '
-            'in brackets the share of complete episodes, of the specialists of the terrains, of the policy '
-            'that was distilled from them, of the same policy after PPO on all terrains, and of the policy '
-            'with the mean weights of both; 200 episodes, seed 0. *Share*: that of the best one, which is '
+            'By `examples/generalist.py` (`--policy generalist`), 200 episodes, seed 0: return, divided by the maximum, '
+            'and share of complete episodes, of the specialists, of the policy distilled from them, of the same '
+            'after PPO on all terrains, and of the mean weights of both. *Share*: that of the best one, which is '
             'shipped, divided by that of the specialist.',
             table(
                 ('environment', 'specialist', 'distilled', 'after PPO', 'mean weights', 'share'),
@@ -408,11 +380,10 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Footstep tracking',
-            'The footstep controller, measured by `examples/evaluate_footsteps.py` in episodes of 20 s, '
-            'seed 0: landing error in m, mean and 90th percentile, and mean heading error in rad when '
-            'a foot lands. *General*: the plans of the environment, with sharp turns; *made from the root*: '
-            'each plan is relative to position and heading of the root, as in the high-level environments; *pushes*: forces '
-            'on the torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
+            'By `examples/evaluate_footsteps.py`, episodes of 20 s, seed 0: landing error in m, mean and 90th '
+            'percentile, and mean heading error in rad. *General*: the plans of the environment, with sharp turns; '
+            '*made from the root*: relative to the root, as in the high-level environments; *pushes*: forces on the '
+            'torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
             table(
                 ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
             ),
@@ -425,7 +396,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Does training on terrain help?',
-            'Comparison with the policy that was trained on flat ground with the same observation.',
+            'Beside the policy that is trained on flat ground with the same observation, in the same episodes.',
             table(
                 ('environment', 'distance, own', 'flat policy', 'ratio', 'complete, own',
                  'flat policy'),
