@@ -36,7 +36,6 @@ ELSEWHERE = {
 }
 PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()} | {
     ROOT / 'README.md': 'index.md',
-    DOCS / 'README.md': 'index.md',
 }
 LINK = re.compile(r'(?<=\]\()(?![a-z]+:|#)([^)#\s]+)')
 # A cell of a table that is a name, and the pages of environments, characters and others by name.
@@ -62,7 +61,6 @@ extensions = [
     'sphinx_design',
 ]
 root_doc = 'index'
-exclude_patterns = ['README.md']  # the index on GitHub; here it is the navigation
 templates_path = ['_templates']
 
 myst_enable_extensions = ['colon_fence', 'substitution']

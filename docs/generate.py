@@ -58,8 +58,7 @@ WITHOUT = {  # policies shown for environments without a shipped policy
     'zero': 'action 0 in every step, which is the default gait (`--policy zero`)',
 }
 README = '../README.md'
-# Comments around the tables of the README that this program writes.
-SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
+# Comments around the sentence of the README that this program writes.
 SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
 SUBSTEPS = 10  # of a control step in benchmarks/vector_environment.py
 MACHINE = (  # that of benchmarks/vector_environment.json
@@ -73,7 +72,6 @@ FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
 def pages() -> dict[str, str]:
     """Returns the text of every page that the repository keeps, by its path below docs/."""
     return {
-        'README.md': home(),
         'environments.md': environment_index(),
         'characters.md': character_index(),
         'terrains.md': terrain_index(),
@@ -117,44 +115,6 @@ def picture(text: str, path: str) -> str:
 
 def links(folder: str, names: Iterable[str]) -> str:
     return ', '.join(f'[{name}](../{folder}/{slug(name)}.md)' for name in names)
-
-
-def home() -> str:
-    return page(
-        'trl_suite',
-        'The Terrain RL Simulator (Berseth, Peng, van de Panne 2018) on MuJoCo: locomotion over random '
-        'terrain, in the style of `dm_control.suite`.',
-        '![Six environments of the suite](pictures/suite.webp)',
-        table(
-            ('reference, generated from the code', ''),
-            (
-                ('[Environments](environments.md)', f'{len(catalogue.SPECS)} in {len(catalogue.FAMILIES)} families'),
-                ('[Characters](characters.md)', len(characters.CHARACTERS)),
-                ('[Terrains](terrains.md)', f'{len(presets())} presets'),
-            ),
-        ),
-        'The site has a page for each of them, and the reference of the Python interface: `pip install -e '
-        "'.[docs]' && sphinx-build docs site`. `trl-suite info ID` prints the page of an environment.",
-        table(
-            ('guide', ''),
-            (
-                ('[Guide](guide.md)', 'commands, combinations, footstep plans, rendering, training'),
-                ('[Notebooks](../colab/README.md)', 'first steps, training, and most of the topics below, with pictures'),
-                ('[Make your own](make_your_own.md)', 'custom characters, terrains and tasks'),
-                ('[Make your own: clips](make_your_own_clips.md)', 'custom clips from motion files'),
-                ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
-                ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
-                ('[Clusters](cluster.md)', 'Ray: evaluation, sequences and training on several machines'),
-                (f'[Worlds and sensors]({REALISM})', 'randomized worlds, pushes, noise, and what they do to policies'),
-                ('[Reliability](reliability.md)', 'guarantees, threads, untrusted files, random tests'),
-                ('[Results](results.md)', 'evaluation of the shipped policies'),
-                ('[Comparison with the papers](findings.md)', 'claims of the papers, and results obtained here'),
-                ('[Differences from the original](differences.md)', 'with reasons'),
-                ('[Speed](speed.md)', 'compared with raw MuJoCo and other libraries'),
-                ('[The physics rate](../benchmarks/physics_rate.md)', 'the choice of the time step'),
-            ),
-        ),
-    )  # fmt: skip
 
 
 # Environments
@@ -547,6 +507,7 @@ def submitted(spec: catalogue.EnvSpec, path: pathlib.Path) -> dict[str, Any]:
 # Speed
 
 
+SHOWN = '16 ', '256 '  # simulations
 PROJECTED = '1024 simulations, 2 threads'
 
 
@@ -593,72 +554,35 @@ def cost() -> str:
 
 
 def readme() -> str:
-    """Returns README.md with its tables."""
+    """Returns README.md with the scores of the shipped policies."""
     text = (DOCS / README).read_text(encoding='utf-8')
-    for (start, end), written in ((SOLVED, solved()), (SPEED, speed())):
-        before, _, rest = text.partition(start)
-        text = f'{before}{start}\n{written}\n{end}{rest.partition(end)[2]}'
-    return text
+    (start, end), (before, _, rest) = SOLVED, text.partition(SOLVED[0])
+    return f'{before}{start}\n{solved()}\n{end}{rest.partition(end)[2]}'
 
 
 def solved() -> str:
-    """Returns the scores of the shipped policies by family."""
-    cells = []
-    for domain in catalogue.FAMILIES:
-        specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
-        entries = filter(None, (gallery.record(spec.id) for spec in specs))
-        found = [
-            next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
-            for entry in entries
-        ]
-        found += [
-            stored('shared')[spec.id]['evaluation'] for spec in specs if spec.id in stored('shared')
-        ]
-        middle = {
-            name: statistics.median(each[name] for each in found)
-            for name in ('normalized_return', 'completion_rate', 'distance')
-        }
-        # Gaits are scored by distance; their return has no fixed maximum.
-        gaits = all(task_type(spec).score == 'distance' for spec in specs)
-        cells.append((
-            f'`{domain}`', f'{len(found)} of {len(specs)}',
-            *(('–', '–') if gaits else (f'{middle["normalized_return"]:.2f}', f'{middle["completion_rate"]:.0%}')),
-            f'{middle["distance"]:.0f} m',
-        ))  # fmt: skip
-    said = (
-        'Medians over the environments of each family that have a policy, each evaluated with the mean of '
-        'its actions in 50 episodes (`terrainrl`: up to 200): the return divided by its maximum, the share of '
-        'episodes that lasted to the end, and the mean distance. Episodes of `terrainrl` end with a fall '
-        'or after 5000 gait cycles.'
+    """Returns a sentence with the scores of the shipped policies by family."""
+    scores: dict[str, list[float]] = {domain: [] for domain in catalogue.FAMILIES}
+    gaits = set()
+    for spec in catalogue.SPECS:
+        score = task_type(spec).score
+        if score == 'distance':
+            gaits.add(spec.domain)
+        if spec.id in stored('shared'):
+            scores[spec.domain].append(stored('shared')[spec.id]['evaluation'][score])
+        elif entry := gallery.record(spec.id):
+            run = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
+            scores[spec.domain].append(run['evaluation'][score])
+    medians = ', '.join(
+        f'{statistics.median(found):{".0f" if domain in gaits else ".2f"}}{" m" * (domain in gaits)} (`{domain}`)'
+        for domain, found in scores.items()
     )
-    header = ('family', 'with a policy', 'return', 'complete', 'distance')
-    return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
-
-
-def speed() -> str:
-    """Returns the table of the README with the rates of some environments."""
-    found, cells = speeds(), []
-    for id, alone in found['single'].items():
-        own, raw = found['ours'][id], alone['mj_step'] / SUBSTEPS
-        one, two = (f'256 simulations, {threads} threads' for threads in (1, 2))
-        cells.append((
-            f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / raw:.2f})',
-            *(f'{own[n]["control steps per second"]} ({own[n]["ratio to the engine"]:.2f})'
-              for n in (one, two)),
-            f'{own[one]["reset"]:.2f} ms',
-            f'{found["memory per simulation, kB"][id]} kB',
-        ))  # fmt: skip
-    header = (
-        '', 'one simulation', '256, one thread', '256, two threads', 'reset', 'memory per simulation',
-    )  # fmt: skip
     said = (
-        'Control steps per second (of 10 physics steps each) with random actions; with 256 simulations, '
-        'resets with new terrain are included. In brackets: the ratio to raw MuJoCo with the same model, '
-        '`mj_step` for one simulation and MuJoCo on the same threads for 256 (it can be above 1, because '
-        'raw MuJoCo does not reset: its characters lie on the ground, where physics steps cost more). Measured by '
-        f'`python benchmarks/vector_environment.py` on {MACHINE}.'
+        f'{sum(map(len, scores.values()))} of {len(catalogue.SPECS)} environments have a trained policy. Median '
+        f'scores: {medians}. A score is the return as a share of its maximum, and for gaits the distance to the '
+        f'first fall within {GAIT_LIMIT} cycles. Each policy: [docs/results.md](docs/results.md).'
     )
-    return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
+    return textwrap.fill(said, 112, break_on_hyphens=False)
 
 
 def speed_page() -> str:
@@ -666,10 +590,11 @@ def speed_page() -> str:
     cells = [
         (
             f'`{id}`', setting, own['control steps per second'],
-            *(f'{own[name]:.2f}' for name in ('ratio to the engine', 'serial', 'reset', 'resets')),
+            *(f'{own[name]:.2f}' for name in ('ratio to the engine', 'reset', 'resets')),
         )
         for id, settings in found['ours'].items()
         for setting, own in settings.items()
+        if setting.startswith(SHOWN)
     ]  # fmt: skip
     single = [
         (
@@ -684,32 +609,27 @@ def speed_page() -> str:
     ]
     return page(
         'Speed',
-        f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random, and a '
-        'control step is 10 physics steps. `trl-suite bench ID` measures the rates of your machine.',
+        f'Control steps per second, of 10 physics steps each, with random actions. Measured by `python '
+        f'benchmarks/vector_environment.py` on {MACHINE}; `trl-suite bench ID` measures your machine.',
         '## Single environment',
         table(
             ('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per simulation of a vector environment'),
             single,
         ),
         '## Vector environment',
-        'Resets with new terrain are included. *Ratio* is relative to MuJoCo alone with the same models, '
-        'number of simulations and threads; it can be above 1, because MuJoCo alone does not reset: its '
-        'characters lie on the ground, where physics steps cost more. *Serial* is the part of a control step that runs on one '
-        'thread while the others wait, in us per simulation; *resets* is the share of time spent in resets.',
-        table(('environment', '', 'control steps per s', 'ratio', 'serial', 'reset, ms', 'resets'), cells),
+        'Resets with new terrain are included; *resets* is their share of the time. *Ratio* is relative to MuJoCo '
+        'alone with the same models, simulations and threads. It can be above 1, because MuJoCo alone does not '
+        'reset: its characters lie on the ground, where physics steps cost more.',
+        table(('environment', '', 'control steps per s', 'ratio', 'reset, ms', 'resets'), cells),
         '![Rates by simulations and threads](../benchmarks/vector_environment.png)',
         '## More cores',
-        'A projection, not a measurement: the rate of 1024 simulations as a multiple of the rate on one core, '
-        "by Amdahl's law from the serial part (*serial* above). Shared memory bandwidth and caches are "
-        'neglected. `trl-suite bench ID` prints the projection for your machine.',
+        'Projected rate of 1024 simulations as a multiple of the rate on one core, by Amdahl\'s law from the part of '
+        'a control step that runs on one thread. Limits of memory bandwidth and caches are not included.',
         table(('environment', '16 cores', '64 cores'), projected),
         '## Other libraries',
-        'Measured in the same run, as a ratio to raw `mj_step` with their own models; none of them has '
-        'terrain.',
+        'Ratios to raw `mj_step` with their own models, in the same run; none of them has terrain.',
         table(('', 'ratio'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
-        'All figures: [vector_environment.json](../benchmarks/vector_environment.json). '
-        '`benchmarks/training.py` measures the cost of training, and `benchmarks/hierarchy.py` that of '
-        'high-level steps.',
+        'All figures: [vector_environment.json](../benchmarks/vector_environment.json).',
     )  # fmt: skip
 
 
