@@ -156,7 +156,7 @@ class ActionMapTest(parameterized.TestCase):
         for options in (
             {'action_offset': [0.0]}, {'action_offset': [np.nan] * 6}, {'action_scale': 0}, {'action_scale': -1},
         ):  # fmt: skip
-            with self.assertRaisesRegex(ValueError, 'action_offset and action_scale'):
+            with self.assertRaisesRegex(ValueError, 'action_offset|action_scale'):
                 Mounted('biped2d', 'position', **options)
 
     def test_position_options_of_a_prismatic_joint(self):

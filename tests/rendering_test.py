@@ -570,7 +570,9 @@ class SpatialTest(FolderTest):
         self.assertGreater(a.shape[1], d.shape[1])
         for preset in ('plane', 'conveyor3d'):  # level ground
             rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
-        with self.assertRaisesRegex(ValueError, r'length is 301; expected metres in \(0, 300\]'):
+        with self.assertRaisesRegex(
+            ValueError, 'length is 301; expected a number above 0 and at most 300, in m'
+        ):
             rendering.plot_terrain('plane', self.folder / 'f.png', length=301)
         self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
 

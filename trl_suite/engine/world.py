@@ -177,7 +177,7 @@ class World:
         data.warning.number[:] = 0
         self.engine.time[env_id] = data.time
         mujoco.mj_forward(model, data)
-        native.physics_to_arrays(env_id, self.pack)
+        native.physics_to_arrays(self.all_ids[env_id], self.pack)  # not a negative index
 
     def diverged(self) -> np.ndarray:
         """Returns which simulations have had a non-finite or huge state since their reset, (n,)."""

@@ -188,10 +188,11 @@ class HierarchicalNavigation(SpatialTask):
         )  # fmt: skip
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
-        self._controller_blocks = tuple(
-            block.observed_if(policy is None or block.name in dict(policy.blocks))
-            for block in (*self.figure.blocks, PHASE, CONTACT, PLAN)
-        )
+        blocks = *self.figure.blocks, PHASE, CONTACT, PLAN
+        if policy is not None and {(b.name, b.size) for b in blocks}.issuperset(policy.blocks):
+            # It may have been trained without some of them.
+            blocks = tuple(block.observed_if(block.name in dict(policy.blocks)) for block in blocks)
+        self._controller_blocks: tuple[Block, ...] = blocks
         self.controller.check(character.spec, layout(self._controller_blocks), self.joint_map)
         # A custom function is called on one thread, for all simulations together.
         self.in_parts = policy is not None
