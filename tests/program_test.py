@@ -1,5 +1,6 @@
 """Tests of trl_suite.util.program, and of what signals must not interrupt."""
 
+import ctypes
 import signal
 import sys
 import time
@@ -43,6 +44,24 @@ class SignalTest(parameterized.TestCase):
         report.assert_called_once()
         self.assertIs(type(caught.exception), exception)
         self.assertIs(signal.getsignal(signal.SIGTERM), before)
+
+    @parameterized.parameters(
+        (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, program.Terminated)
+    )
+    def test_a_signal_in_a_conversion_of_ctypes_ends_the_program(self, number, exception):
+        """ctypes raises an ArgumentError in place of any exception of a conversion."""
+
+        class Argument:
+            @classmethod
+            def from_param(cls, value):
+                signal.raise_signal(number)
+
+        function = ctypes.PYFUNCTYPE(None, ctypes.py_object)(lambda value: None)
+        function.argtypes = [Argument]
+        with self.assertRaises(KeyboardInterrupt) as caught, program.terminable():
+            function(1)
+        self.assertIs(type(caught.exception), exception)
+        self.assertIsInstance(caught.exception.__cause__, ctypes.ArgumentError)
 
     def test_closing_an_environment_is_not_interrupted(self):
         """A rendering context that is half freed would be freed again, which prints a traceback."""

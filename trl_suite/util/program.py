@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import Any
 
 # Exceptions that users can cause. Any other one is a defect, and its traceback is printed.
 EXPECTED = (ValueError, ImportError, RuntimeError, OSError)
@@ -38,19 +39,41 @@ def terminable() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = _handle_signals()
     sys.unraisablehook = hook = _SendingAgain(sys.unraisablehook)
     try:
         yield
+    except Exception as error:
+        if _received is not None:
+            raise _received from error
+        raise
     finally:
         if not hook.ends:
             sys.unraisablehook = hook.before
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _terminate(number: int, frame: object) -> None:
-    signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
-    raise Terminated
+# What the last signal raised. ctypes and other C code may raise an exception of their own in its place.
+_received: type[KeyboardInterrupt] | None = None
+
+
+def _handle_signals() -> dict[signal.Signals, Any]:
+    """Handles SIGTERM, and SIGINT unless it is ignored; returns the former handlers."""
+    global _received
+    _received = None
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        numbers.append(signal.SIGINT)
+    return {number: signal.signal(number, _raise) for number in numbers}
+
+
+def _raise(number: int, frame: object) -> None:
+    global _received
+    if number == signal.SIGTERM:
+        signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
+    _received = Terminated if number == signal.SIGTERM else KeyboardInterrupt
+    raise _received
 
 
 class _SendingAgain:
@@ -76,7 +99,7 @@ class _SendingAgain:
         self.ends, number = True, signal.SIGINT
         if issubclass(ignored.exc_type, Terminated):
             number = signal.SIGTERM
-            signal.signal(number, _terminate)
+            signal.signal(number, _raise)
         timer = threading.Timer(0.01, os.kill, (os.getpid(), number))  # after this callback
         timer.daemon = True
         timer.start()
@@ -91,13 +114,15 @@ def begin_script() -> None:
         return
     name = pathlib.Path(sys.argv[0]).name
     sys.excepthook = lambda *raised: _report(name, *raised)
-    signal.signal(signal.SIGTERM, _terminate)
+    _handle_signals()
     sys.unraisablehook = _SendingAgain(sys.unraisablehook)
 
 
 def _report(
     name: str, kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
+    if issubclass(kind, Exception) and _received is not None:
+        kind = _received
     if issubclass(kind, KeyboardInterrupt):
         how = 'terminated' if issubclass(kind, Terminated) else 'interrupted'
         print(f'{name}: {how}', file=sys.stderr)
