@@ -29,7 +29,7 @@ from ray import cluster_utils
 from trl_suite import evaluation, policies
 from trl_suite.adapters.ray import RayExecutor
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import train_all
 
 LONG = 'PD_Biped2D_Flat-v0'  # the run whose overhead is measured

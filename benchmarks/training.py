@@ -1,4 +1,4 @@
-"""Measures the cost of learning: samples per second of examples/ppo.py and of random actions.
+"""Measures the cost of learning: samples per second of training/ppo.py and of random actions.
 
     python benchmarks/training.py [--seconds S] [--threads N] [--torch-threads N]
 
@@ -16,7 +16,7 @@ import torch
 
 from trl_suite.vector import VectorEnvironment
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import ppo
 
 IDS = (

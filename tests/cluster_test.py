@@ -24,7 +24,7 @@ from absl.testing import absltest
 
 from trl_suite import evaluation, policies, sequences
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import ppo
 import ppo_settings
 import train_all
@@ -84,7 +84,7 @@ class InBackground(threading.Thread):
 class TwoNodes(absltest.TestCase):
     def setUp(self):
         super().setUp()
-        paths = os.pathsep.join((str(ROOT), str(ROOT / 'examples')))
+        paths = os.pathsep.join((str(ROOT), str(ROOT / 'training')))
         # In a folder of its own, so that other programs on this machine do not join the cluster.
         folder = self.enterContext(tempfile.TemporaryDirectory(dir='/tmp'))  # paths must be short
         self.enterContext(
@@ -254,7 +254,7 @@ class TrainingTest(TwoNodes):
             folder = self.folder()
             subprocess.run(
                 [
-                    sys.executable, ROOT / 'examples' / 'train_all.py', '--filter', 'PD_Biped2D_Flat-v0',
+                    sys.executable, ROOT / 'training' / 'train_all.py', '--filter', 'PD_Biped2D_Flat-v0',
                     '--samples', '4096', '--runs', folder / 'runs', *words,
                 ],
                 env={**os.environ, 'TRL_SUITE_TRAINED': str(folder / name)},

@@ -311,8 +311,8 @@ class SiteTest(absltest.TestCase):
             for link in _LINK.findall(text):
                 self.assertTrue((DOCS / link).exists(), f'{name}: {link}')
         self.assertEqual(
-            self.page('guide', '[a](../CONTRIBUTING.md#layers) [b](../examples/ppo.py) [c](#d)'),
-            '[a](contributing.md#layers) [b](../examples/ppo.py) [c](#d)',
+            self.page('guide', '[a](../CONTRIBUTING.md#layers) [b](../training/ppo.py) [c](#d)'),
+            '[a](contributing.md#layers) [b](../training/ppo.py) [c](#d)',
         )
 
     def test_names_in_tables_are_links(self):

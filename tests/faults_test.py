@@ -29,7 +29,7 @@ from trl_suite import cli, motion, policies, sequences, suite, terrain
 from trl_suite.util import files, program
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import checkpoints
 import gallery
 import ppo

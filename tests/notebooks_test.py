@@ -28,7 +28,7 @@ EXTRAS = {
     'trl_suite.adapters.stable_baselines': 'stable_baselines3'
 }  # module -> what it needs beside us
 _ID = re.compile(r'\b\w[\w-]*-v0\b')
-_FILE = re.compile(r'\b(?:docs|examples|trained)/[\w/]+\.\w+')
+_FILE = re.compile(r'\b(?:docs|examples|trained|training)/[\w/]+\.\w+')
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
 _ABSOLUTE = re.compile(r'(?<![\w/.:])/\w+/\w')
 _MAGIC = re.compile(r'^(\s*)[%!].*$', re.MULTILINE)

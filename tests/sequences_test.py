@@ -21,7 +21,7 @@ from trl_suite.sequences import results
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import continual_baselines
 import plaid
 

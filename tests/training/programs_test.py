@@ -1,0 +1,818 @@
+"""Tests of the programs that train and compare: which runs there are, and in which order."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import pathlib
+import sys
+import tempfile
+from types import SimpleNamespace
+from unittest import mock
+
+import checkpoints
+import compare_actions
+import compare_hierarchy
+import compare_transfer
+import evaluate_footsteps
+import evaluate_plans
+import expert
+import generalist
+import joint_expert
+import numpy as np
+import ppo
+import ppo_settings
+import share_gaits
+import train_all
+import train_randomized
+import tune_base_actions
+import tune_gait
+from absl.testing import absltest, parameterized
+from helpers import FolderTest
+
+from trl_suite import characters, controllers, evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.util import files, resources
+from trl_suite.vector import VectorEnvironment
+
+
+class CompareActionsTest(FolderTest):
+    def run_program(self, *arguments):
+        trained = []
+
+        def train(id_, action, seed, cycles, runs):
+            trained.append((action, seed))
+            curve = [[8, 50.0], [16, 60.0 + seed]]
+            return {'distance': 100.0 * seed + len(action), 'speed': 3.0, 'curve': curve}
+
+        path = self.folder / 'found.json'
+        argv = ['compare_actions.py', '--json', str(path), *arguments]
+        with (
+            mock.patch.object(compare_actions, 'train', train),
+            mock.patch.object(sys, 'argv', argv),
+            contextlib.redirect_stdout(io.StringIO()) as out,
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            compare_actions.main()
+        return trained, out.getvalue()
+
+    def test_finished_runs_are_kept_and_shown(self):
+        first, out = self.run_program()
+        self.assertEqual(
+            first, [(action, 1) for action in ('discrete', 'continuous', 'both', 'ppo')]
+        )
+        self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
+        second, out = self.run_program('--seeds', '1', '2')
+        self.assertEqual(second, [(action, 2) for action, _ in first])
+        self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
+        with self.assertRaisesRegex(
+            ValueError, 'cycles is 32768.*, not 100.*; give another --json'
+        ):
+            self.run_program('--cycles', '100')
+
+    def test_learning_curves_are_drawn(self):
+        from matplotlib import pyplot
+
+        picture = self.folder / 'curves.png'
+        with mock.patch.object(pyplot, 'close'):
+            self.run_program('--seeds', '1', '2', '--picture', str(picture))
+        axis = pyplot.gca()
+        pyplot.close('all')
+        self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
+        drawn = [line.get_xydata().tolist() for line in axis.get_lines()]
+        for seed in (1, 2):
+            self.assertIn([[0.008, 50], [0.016, 60 + seed]], drawn)
+        self.assertIn([[32.768, 208]], drawn)  # discrete, seed 2
+        self.assertLen(axis.get_legend().get_texts(), 4)
+
+    @parameterized.parameters(
+        (compare_actions.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
+        (compare_actions.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
+    )
+    def test_a_run_has_the_settings_of_its_action(self, trainer, action, expected):
+        asked = []
+
+        def train(id_, seed, settings, folder, threads):
+            asked.append((settings, folder))
+            folder.mkdir(parents=True)
+            policies.save(policies.reference(id_), folder / 'policy.npz')
+            return [{'samples': 8, 'distance': 3.0}]
+
+        with (
+            mock.patch.object(compare_actions, 'EPISODES', 1),
+            mock.patch.object(trainer, 'train', train),
+        ):
+            found = compare_actions.train(
+                'FSM_Hopper2D_Terrain_Gaps-v0', action, 3, 64, self.folder
+            )
+        ((settings, _),) = asked
+        expected = {**expected, 'samples': 64, 'evaluate_every': 16}
+        self.assertEqual({name: getattr(settings, name) for name in expected}, expected)
+        self.assertEqual(found['curve'], [[8, 3.0]])
+        self.assertGreater(found['distance'], 2.0)
+
+
+class CompareHierarchyTest(FolderTest):
+    def run_program(self, *arguments):
+        trained = []
+
+        def job(task, kind, seed, control_steps, runs):
+            trained.append((task, kind, seed))
+            last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
+            first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
+            return [
+                {'control_steps': control_steps * (i + 1) / 2, **each}
+                for i, each in enumerate((first, last))
+            ]
+
+        path = self.folder / 'found.json'
+        argv = ['compare_hierarchy.py', '--json', str(path), *arguments]
+        with (
+            mock.patch.object(compare_hierarchy, 'job', job),
+            mock.patch.object(sys, 'argv', argv),
+            contextlib.redirect_stdout(io.StringIO()) as out,
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            compare_hierarchy.main()
+        return trained, out.getvalue()
+
+    def test_finished_runs_are_kept_and_shown(self):
+        first, _ = self.run_program('--seeds', '1', '--tasks', 'trail')
+        self.assertEqual(first, [('trail', 0, 1), ('trail', 1, 1)])
+        second, out = self.run_program('--seeds', '1', '2')
+        self.assertNotIn(('trail', 0, 1), second)
+        self.assertLen(second, 6)
+        self.assertIn(
+            'median distance along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out
+        )
+        self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
+        with self.assertRaisesRegex(
+            ValueError, 'control_steps is 1200000.0, not .*; give another --json'
+        ):
+            self.run_program('--control-steps', '100')
+
+    def test_curves_are_drawn(self):
+        from matplotlib import pyplot
+
+        picture = self.folder / 'curves.png'
+        with mock.patch.object(pyplot, 'close'):
+            self.run_program('--seeds', '1', '2', '--picture', str(picture))
+        trail, soccer = pyplot.gcf().axes
+        pyplot.close('all')
+        self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
+        drawn = [line.get_xydata().tolist() for line in trail.get_lines()]
+        self.assertIn([[0.6, 1.0], [1.2, 20.0]], drawn)  # with hierarchy, seed 2
+        self.assertLen(soccer.get_lines(), 4)
+        self.assertEqual(
+            [text.get_text() for text in trail.get_legend().get_texts()],
+            ['with hierarchy', 'without'],
+        )
+
+    @parameterized.parameters((0, 15), (1, 1))
+    def test_both_kinds_have_the_same_number_of_control_steps(self, kind, each):
+        """A plan of footsteps lasts 15 control steps of 1/30 s."""
+        asked = []
+
+        def run(id_, make, episodes, seed):
+            asked.append(make(None).id)
+            return {'trail': 1.0}
+
+        def shorter(id_, **changes):
+            tiny = {'num_envs': 2, 'horizon': 4, 'minibatch': 8}
+            return ppo_settings.settings_for(id_, **{**changes, **tiny})
+
+        module = mock.Mock(settings_for=shorter)
+        with (
+            mock.patch.object(compare_hierarchy.evaluate_plans, 'run', run),
+            mock.patch.object(compare_hierarchy, 'ppo_settings', module),
+        ):
+            found = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
+            with mock.patch.object(compare_hierarchy.ppo, 'Trainer') as trainer:
+                again = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
+        steps = [point['control_steps'] for point in found]
+        self.assertEqual(steps, [8 * each, 16 * each, 24 * each, 32 * each])
+        self.assertEqual(set(asked), {compare_hierarchy.TASKS['soccer'][kind]})
+        trainer.assert_not_called()  # the policies of a finished training are evaluated only
+        self.assertEqual(again, found)
+
+
+class TuneTest(absltest.TestCase):
+    def test_base_actions_that_no_search_has_found_get_scores(self):
+        gait = controllers.load('hopper')
+        written = {}
+        with (
+            mock.patch.object(tune_base_actions, 'VALIDATION', 2),
+            mock.patch.object(
+                tune_base_actions.tune_gait, 'write', lambda name, data: written.update(data)
+            ),
+        ):
+            obstacles = tune_base_actions.Obstacles(gait, 'mixed_hopper', gait.base_actions[0], 2)
+            tune_base_actions.score(obstacles, 'mixed_hopper', np.random.default_rng(0))
+        self.assertEqual(set(written['tuning']), {name for name, _, _ in gait.blends} - {'run'})
+        self.assertEqual(written['tuning'].pop('steady')['search'], 'steady')
+        for each in written['tuning'].values():
+            self.assertBetween(each['alone'], 0, each['set_after'])
+            self.assertBetween(each['set_before'], each['default'], each['set_after'])
+            self.assertLessEqual(each['set_after'], 1)
+
+    def test_gaits_within_the_action_range_are_stored_and_kept(self):
+        gait = controllers.load('dog')
+
+        class Strategy:
+            def __init__(self, start, sd, options):
+                self.rng, self.shape = np.random.default_rng(0), (options['popsize'], len(start))
+                self.result = mock.Mock(xfavorite=start)
+
+            def ask(self):
+                return list(self.rng.normal(0, 50, self.shape))
+
+            def tell(self, candidates, values):
+                pass
+
+        arguments = mock.Mock(population=5, generations=3, sd=1.0)
+        for within in (True, False):
+            arguments.within = within
+            with mock.patch.dict(sys.modules, cma=mock.Mock(CMAEvolutionStrategy=Strategy)):
+                found = tune_base_actions.search(
+                    lambda vectors: np.zeros(len(vectors)), gait.base_actions[3], gait, arguments,
+                    np.random.default_rng(0),
+                )  # fmt: skip
+            self.assertEqual(bool(np.abs(gait.action(found)).max() <= 1 + 1e-9), within)
+        np.testing.assert_allclose(found[0], gait.base_actions[3], atol=1e-4)
+
+        stairs = {'vector': gait.base_actions[3].tolist(), 'tuning': {'within': True}}
+        others = {'vector': gait.base_actions[1].tolist(), 'tuning': {}}
+        data = tune_gait.stored('dog')
+        with (
+            mock.patch.object(tune_base_actions.tune_gait, 'stored', lambda name: data),
+            mock.patch.object(tune_base_actions.tune_gait, 'write', lambda name, data: data),
+        ):
+            with self.assertRaisesRegex(ValueError, "'wall'.*did you mean 'walk'"):
+                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['wall'])
+            with self.assertRaisesRegex(ValueError, "'other'"):
+                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['other'])
+            tune_base_actions.add('dog', {'walk': stairs}, ['walk'])
+            written = tune_base_actions.enter('dog', {}, ['0', '1'])
+            data['action_offset'] = 1  # the default gait is the second base action
+            with self.assertRaisesRegex(ValueError, '1 gaits.*base action 1'):
+                tune_base_actions.enter('dog', {}, ['0'])
+        self.assertEqual(written['sets']['walk'], stairs['vector'])
+        self.assertEqual(written['tuning']['walk'], {'within': True})
+        self.assertNotIn('walk', [name for names in written['base_actions'] for name in names])
+
+    def test_a_steady_gait_lands_where_it_is_expected(self):
+        gait, seeds = controllers.load('hopper'), np.arange(6)
+        vectors = np.array([gait.sets['run'], gait.sets['steady'], gait.sets['foot_back']])
+        rows = len(vectors) * len(seeds) * tune_base_actions.COPIES
+        bench = tune_gait.Bench('hopper', rows, gait.action_offset)
+        score, figures = tune_base_actions.steadiness(bench, vectors, 1.4, seeds)
+        self.assertEqual(figures['spread'].shape, (3, tune_base_actions.AHEAD))
+        np.testing.assert_array_less(2 * figures['spread'][1, 1:], figures['spread'][0, 1:])
+        self.assertGreater(score[1], score[0])
+        self.assertEqual(figures['upright'][:2].tolist(), [1, 1])
+        self.assertLess(figures['upright'][2], 1)  # this action is not one to repeat
+        self.assertLess(score[2], score[0])
+        longer, again = tune_base_actions.steadiness(bench, vectors, 3.0, seeds)
+        np.testing.assert_array_equal(again['length'], figures['length'])
+        expected = (
+            score - 2 * (3.0 - figures['length']) + 2 * np.maximum(0, 1.4 - figures['length'])
+        )
+        np.testing.assert_allclose(longer, expected)
+
+    def test_base_actions_of_the_hopper_differ_in_the_length_of_a_hop(self):
+        gait = controllers.load('hopper')
+        names = [f'shorter_{n}' for n in range(5, 0, -1)] + ['steady']
+        names += [f'longer_{n}' for n in range(1, 6)]
+        bench = tune_gait.Bench('hopper', len(names), gait.action_offset)
+        environments = bench.environments
+        environments.reset(seed=[3] * len(names))
+        for _ in range(6):
+            environments.step(bench.actions(np.tile(gait.sets['steady'], (len(names), 1))))
+        before = tune_gait.position(environments)
+        np.testing.assert_array_equal(before, before[0])
+        environments.step(bench.actions(np.array([gait.sets[name] for name in names])))
+        length = tune_gait.position(environments) - before
+        np.testing.assert_array_less(0.02, np.diff(length))
+        self.assertLess(length[0], 0.6)
+        self.assertGreater(length[-1], 2.2)
+
+
+class JobsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ({}, 'policy'),
+        ({'stages': [[0.0, {}]]}, 'last'),
+        ({'cloned': 100.0}, 'last'),  # imitation only
+        ({'cloned': 60.0}, 'policy'),
+    )
+    def test_policy_of_a_run(self, settings, name):
+        folder = self.enterContext(tempfile.TemporaryDirectory())
+        curve = {'settings': {'samples': 100.0, **settings}}
+        pathlib.Path(folder, 'curve.json').write_text(json.dumps(curve))
+        for number, each in enumerate(('policy', 'last')):
+            policy = policies.reference('PD_Biped2D_Flat-v0')
+            info = {**policy.info, 'samples': number}
+            policies.save(
+                dataclasses.replace(policy, info=info), pathlib.Path(folder, f'{each}.npz')
+            )
+        with mock.patch.object(train_all.evaluation, 'evaluate', return_value={}):
+            run = train_all.measured('PD_Biped2D_Flat-v0', pathlib.Path(folder), '', 0.0)
+        self.assertEqual(run.entry['shipped_at'], ('policy', 'last').index(name))
+
+    def test_every_environment_is_trained_but_for_most_gaits(self):
+        ids = {id_ for id_, _ in train_all.jobs('*')}
+        gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.task_type == 'gait'}
+        self.assertEqual(ids, set(catalogue.BY_ID) - gaits | set(train_all.GAITS))
+
+    def test_actuation_models_are_compared_with_three_seeds(self):
+        """Twelve cells: torque, velocity, position and muscle, of biped, dog and raptor."""
+        again = {id_ for id_, seed in train_all.jobs('*') if seed == 3}
+        self.assertLen(again, 12)
+        self.assertLen([id_ for id_ in again if id_.startswith('MTU_')], 3)
+
+    def test_policies_that_a_run_uses_are_trained_before(self):
+        seen = set()
+        for id_, _ in train_all.jobs('*'):
+            start = ppo_settings.settings_for(id_).start
+            if start and start not in ppo.TEACHERS:
+                self.assertIn(start, seen, id_)
+            if '_HLC_' in id_:
+                walker = 'Run_FootStep' if '_Run-' in id_ else 'General_Step'
+                self.assertEqual(train_all.needed(id_), [f'PD_Biped3D_LLC_{walker}-v0'])
+                self.assertContainsSubset(train_all.needed(id_), seen)
+            seen.add(id_)
+
+    def test_runs_that_use_the_policy_of_a_failed_run_are_not_trained(self):
+        flat, incline = (f'PD_Biped2D_{name}-v0' for name in ('Flat', 'Incline'))
+        self.assertEqual(train_all.needed(incline), [flat])
+        done = []
+
+        def work(id_, seed):
+            done.append(id_)
+            raise ValueError('no network')
+
+        self.enterContext(mock.patch.object(train_all, 'in_processes', lambda _: work))
+        folder = self.enterContext(tempfile.TemporaryDirectory())
+        self.enterContext(mock.patch.dict(os.environ, TRL_SUITE_TRAINED=folder))
+        out = self.enterContext(contextlib.redirect_stdout(io.StringIO()))
+        self.enterContext(contextlib.redirect_stderr(io.StringIO()))
+        with self.assertRaisesRegex(RuntimeError, '4 of 4 runs failed'):
+            train_all.main(['--filter', 'PD_Biped2D_[FI]*'])
+        self.assertLen(done, 3)
+        self.assertNotIn(incline, done)
+        self.assertIn(f'{flat:40}    1  ValueError: no network', out.getvalue())
+        self.assertIn(f'{incline:40}    1  RuntimeError: not trained, since', out.getvalue())
+
+    def test_a_run_in_progress_is_not_overwritten(self):
+        runs = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        folder = runs / 'PD_Biped2D_Flat-v0' / 'seed_1'
+        work = train_all.in_processes(
+            train_all.parsed(['--runs', str(runs), '--overwrite', '--samples', '1'])
+        )
+        with (
+            checkpoints.only_run(folder),
+            self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
+        ):
+            work('PD_Biped2D_Flat-v0', 1)
+        self.assertTrue(folder.exists())
+
+    def test_files_that_a_run_reads(self):
+        """The policies of the start and of the controller, and which environments share them."""
+        for id_, expected in (
+            ('PD_Biped2D_Incline-v0', {'PD_Biped2D_Incline-v0', 'PD_Biped2D_Flat-v0'}),
+            (
+                'PD_Biped3D_HLC_Soccer-v0',
+                {'PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_General_Step-v0'},
+            ),
+        ):
+            given = train_all.given(id_)
+            self.assertEqual(given.keys(), {f'{each}.npz' for each in expected} | {'shared.json'})
+            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+            for name, content in given.items():
+                (folder / name).write_bytes(content)
+            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+                self.assertEqual(set(policies.available()), expected)
+                VectorEnvironment(id_, 1, 1, 0).close()
+        self.assertGreater(len(policies.available()), 50)
+
+    def test_a_better_run_replaces_the_policy_of_another_environment(self):
+        id_, other = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0'
+        for returned, used in ((20.0, other), (22.0, id_)):
+            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+            entry = {'policy': other, 'evaluation': {'return': 21.0}}
+            (folder / policies.SHARED).write_text(json.dumps({id_: entry}))
+            run = train_all.Run(
+                {'seed': 1, 'settings': {}, 'evaluation': {'return': returned}},
+                policies.reference(id_), 'here', 1.0,
+            )  # fmt: skip
+            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+                train_all.enter(id_, 1, run)
+                self.assertEqual(policies.trained_for(id_), used)
+                self.assertIn(id_, policies.available())
+
+    def test_a_policy_that_others_use_is_kept(self):
+        folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        for id_ in 'abcd':
+            (folder / f'{id_}.npz').touch()
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+            share_gaits.remove_unused(
+                {'b': {'policy': 'a'}, 'c': {'policy': 'b'}, 'e': {'policy': 'd'}}
+            )
+        self.assertCountEqual([path.stem for path in folder.iterdir()], 'abd')
+
+    def test_the_best_preference_is_selected(self):
+        id_ = 'FSM_Raptor2D_Terrain_Mixed-v0'
+        policy = policies.reference(id_)
+
+        def evaluate(id_, candidate, *options):
+            added = float((candidate.biases[-1] - policy.biases[-1]).max())
+            return {'distance': -abs(added - 1.25)}
+
+        with (
+            mock.patch.object(share_gaits.evaluation, 'evaluate', evaluate),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            preference, best = share_gaits.preferring(id_, policy, [0, 1, 3], 1, 1)
+        self.assertEqual(preference, 1)
+        np.testing.assert_array_equal(best.biases[-1], policy.with_preference(1).biases[-1])
+
+    def test_initial_policies_control_the_same_joints(self):
+        """They drive the same joints in the same way; the limbs may differ in length."""
+        for id_ in catalogue.BY_ID:
+            start = ppo_settings.settings_for(id_).start
+            if start in catalogue.BY_ID:
+                own, other = (
+                    (list(characters.CHARACTERS[spec.character].joints), spec.actuation)
+                    for spec in (catalogue.BY_ID[id_], catalogue.BY_ID[start])
+                )
+                self.assertEqual(own, other, id_)
+
+
+class RandomizedTest(parameterized.TestCase):
+    """Policies that were trained further in worlds and with sensors that vary."""
+
+    def test_every_run_continues_from_the_shipped_policy(self):
+        for id_ in ppo_settings.RANDOMIZED:
+            settings = ppo_settings.randomized_settings_for(id_)
+            self.assertEqual(settings.start, id_)
+            [(begin, options)] = settings.stages
+            self.assertEqual((begin, settings.evaluated_with.items() <= options.items()), (0, True))
+            self.assertEqual(settings.evaluated_with.keys(), {'randomize', 'sensors'})
+            self.assertNotIn('pushes', options)  # those of the preset
+            self.assertEqual(settings.hidden, ppo_settings.settings_for(id_).hidden)
+
+    def test_every_run_is_shipped(self):
+        self.assertEqual(policies.available('randomized'), tuple(sorted(ppo_settings.RANDOMIZED)))
+
+    @parameterized.parameters(*((id_,) for id_ in policies.available('randomized') or (None,)))
+    def test_what_is_shipped_keeps_its_return(self, id_):
+        """At least 0.9 of the first policy's without disturbances, and 0.9 of that with `robot`.
+
+        With the preset of the training it is not worse than the first policy.
+        """
+        if id_ is None:
+            self.skipTest('no policy is shipped')
+        entry = json.loads(train_randomized.place(id_).read_text())
+        before, settings = entry['before'], ppo_settings.randomized_settings_for(id_)
+        default = dataclasses.asdict(ppo_settings.Settings())  # of settings that were added later
+        expected = json.loads(json.dumps(dataclasses.asdict(settings)))
+        self.assertEqual(json.loads(json.dumps(default)) | entry['settings'], expected)
+        found = {name: result['return'] for name, result in entry['evaluations'].items()}
+        self.assertGreater(found['none'], 0.9 * before['none']['return'])
+        self.assertGreater(found['robot'], 0.9 * found['none'])
+        preset = train_randomized.preset(entry)
+        least = before[preset]['return'] - before[preset]['return_interval']
+        self.assertGreater(found[preset], least)
+        policy, options = (
+            policies.reference(id_, 'randomized'),
+            train_randomized.CONDITIONS['robot'],
+        )
+        environments = VectorEnvironment(id_, 1, 1, 0, task_kwargs=options)
+        self.addCleanup(environments.close)
+        policy.check(environments)
+        self.assertEqual(policy.info['samples'], entry['shipped_at'])
+
+
+class GeneralistTest(FolderTest):
+    """One policy for all terrains of a character."""
+
+    def test_a_short_run_learns_from_the_specialists(self):
+        """The distilled policy acts more like them than a new one."""
+        ids = generalist.ids_of('biped2d')
+        short = generalist.Settings(distilled=1600, rounds=2, epochs=20, each=2)
+        ppo_ = {
+            **short.ppo,
+            'samples': 1000,
+            'averaged': 500,
+            'value_first': 500,
+            'evaluate_every': 1,
+        }
+        short = dataclasses.replace(short, ppo=ppo_)
+        with contextlib.redirect_stderr(io.StringIO()):
+            distilled, policy, curve = generalist.train(ids, 0, short, self.folder)
+        self.assertEqual(policy.id, 'PD_Biped2D_Mixed_Terrain-v0')
+        self.assertNotEmpty(curve)
+        observation = VectorEnvironment(ids[0], 8, 1, 0).reset()
+        action = policies.reference(ids[0])(observation)
+        error = np.abs(distilled(observation) - action).mean()
+        self.assertLess(error, 0.6 * np.abs(action).mean())
+        self.assertGreater(np.abs(policy(observation) - distilled(observation)).max(), 0)
+
+    def test_a_policy_is_entered_for_all_terrains(self):
+        ids = generalist.ids_of('biped2d')
+        policy = policies.reference(ids[-2])
+        with mock.patch.dict(os.environ, {'TRL_SUITE_TRAINED': str(self.folder)}):
+            generalist.enter(ids, policy, {'ids': ids})
+            self.assertEqual(policies.available('generalist'), tuple(sorted(ids)))
+            self.assertEqual(policies.reference(ids[0], 'generalist').id, ids[0])
+
+    @parameterized.parameters(*generalist.CHARACTERS)
+    def test_what_is_shipped_has_the_results_of_its_file(self, character):
+        ids = generalist.ids_of(character)
+        if ids[0] not in policies.available('generalist'):
+            self.skipTest('no policy is shipped')
+        self.assertContainsSubset(ids, policies.available('generalist'))
+        path = resources.directory('trained') / 'generalist' / f'{ids[-2]}.json'
+        entry = json.loads(path.read_text())
+        self.assertEqual(entry['ids'], ids)
+        self.assertEqual(
+            entry['settings'],
+            json.loads(json.dumps(dataclasses.asdict(generalist.SETTINGS[character]))),
+        )
+        policy = policies.reference(ids[0], 'generalist')
+        for id_ in ids[:2]:  # flat ground and an incline, where episodes are alike
+            own = entry[entry['shipped']][id_]['return']
+            self.assertGreater(own, 0.9 * entry['specialists'][id_]['return'])
+            again = evaluation.evaluate(id_, policy, 8, 1)
+            self.assertAlmostEqual(again['return'] / own, 1, delta=0.05)
+
+
+class FootstepsTest(parameterized.TestCase):
+    """The shipped footstep controller."""
+
+    @parameterized.parameters(
+        ('straight, 0.3 m', 0.05), ('straight, 0.7 m', 0.06), ('general', 0.08)
+    )
+    def test_it_lands_on_its_plan(self, condition, error):
+        id_ = evaluate_footsteps.ID
+        found = evaluate_footsteps.run(
+            evaluate_footsteps.row_for(id_, None), policies.reference(id_), 6, 1, 5.0,
+            **evaluate_footsteps.CONDITIONS[condition],
+        )  # fmt: skip
+        self.assertEqual(found['survived'], 1.0)
+        self.assertLess(found['landing'], error)
+
+
+class PageTest(absltest.TestCase):
+    def test_text_between_marks(self):
+        page = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()), 'page.md')
+        page.write_text('before\n<a>\nold\n</a>\nafter\n')
+        files.replace_between(page, '<a>', '</a>', r'new \1')
+        self.assertEqual(page.read_text(), 'before\n<a>\nnew \\1\n</a>\nafter\n')
+        for text in ('', '<a>', '</a> <a>'):
+            page.write_text(text)
+            with self.assertRaisesRegex(ValueError, "page.md: expected the lines '<a>' and '</a>'"):
+                files.replace_between(page, '<a>', '</a>', 'new')
+            self.assertEqual(page.read_text(), text)
+
+
+class TrimTest(absltest.TestCase):
+    def test_only_what_was_always_0_is_left_out(self):
+        rng = np.random.default_rng(0)
+        policy = policies.Policy(
+            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
+            mean=[0, 0.5, 0, 0], std=[1, 0.01, 0.01, 2], clip=10, activation='tanh',
+            columns=[4, 3, 1, 0], weights=[rng.normal(size=(4, 2))], biases=[[0, 0]],
+            log_std=[0, 0],
+        )  # fmt: skip
+        trimmed = train_all.trimmed(policy)
+        self.assertEqual(trimmed.columns.tolist(), [4, 3, 0])  # a constant counts
+        observation = rng.normal(size=(9, 5)) / 10
+        observation[:, 1] = 0.0
+        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=2e-3)  # halves
+        self.assertFalse((trimmed.weights[0].view(np.int32) & 0x1FFF).any())  # 11 bits, kept by zip
+
+    def test_inputs_of_convolutions_keep_their_places(self):
+        rng = np.random.default_rng(0)
+        line = policies.Convolution(
+            line=4, strides=(2,), weights=[rng.normal(size=(2, 1, 3))], biases=[np.zeros(3)]
+        )
+        policy = policies.Policy(
+            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
+            mean=np.zeros(5), std=[1, 1, 1, 0.01, 1], clip=10, activation='relu',
+            weights=[rng.normal(size=(7, 2))], biases=[[0, 0]], log_std=[0, 0], convolution=line,
+        )  # fmt: skip
+        trimmed = train_all.trimmed(policy)
+        observation = rng.normal(size=(9, 5)) / 30
+        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=5e-3)
+        for weights in (trimmed.weights[0], trimmed.convolution.weights[0]):
+            self.assertFalse((weights.view(np.int32) & 0x1FFF).any())
+
+    def test_the_program_of_each_environment(self):
+        for id_, program in (
+            ('PD_Biped2D_Flat-v0', 'ppo'),
+            ('FSM_Raptor2D_Terrain_Slopes_Mixed-v0', 'learn_gaits'),
+            ('FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'refine_gaits'),
+        ):
+            self.assertEqual(train_all.program(id_).__name__, program)
+            self.assertIn('samples', train_all.settings(id_))
+
+    def test_old_entries_get_new_settings(self):
+        id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
+        settings = train_all.settings(id_)
+        old = {**settings, 'first': dict(settings['first']), 'removed': 1}
+        del old['retry'], old['first']['members']
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / f'{id_}.json'
+            path.write_text(json.dumps({'id': id_, 'shipped': 1, 'runs': [{'settings': old}]}))
+            with mock.patch.dict('os.environ', TRL_SUITE_TRAINED=folder):
+                [run] = train_all.entries(id_)
+        default = train_all.refine_gaits.Settings()
+        expected = {**settings, 'retry': default.retry}
+        expected['first'] = {**settings['first'], 'members': default.first.members}
+        self.assertEqual(run['settings'], expected)
+
+
+class ProgramsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        *(
+            path.name
+            for path in sorted(pathlib.Path(ppo.__file__).parent.glob('*.py'))
+            if '__main__' in path.read_text() or '.parse_args(' in path.read_text()
+        )
+    )
+    def test_every_program_ends_errors_in_one_line(self, name):
+        """Either when it is run, or before it parses its arguments; modules of others parse none."""
+        text = (pathlib.Path(ppo.__file__).parent / name).read_text()
+        body = text.split("if __name__ == '__main__':")[-1]
+        self.assertRegex(body, r'(?m)^(    )?begin_script\(\)$')
+
+
+class TransferTest(parameterized.TestCase):
+    def test_flat_ground_of_every_environment(self):
+        for spec in catalogue.SPECS:
+            if spec.domain == 'plaid':
+                flat = catalogue.BY_ID[compare_transfer.flat_ground(spec)]
+                self.assertEqual(
+                    (flat.terrain, flat.character, dict(flat.options)),
+                    ('flat', spec.character, dict(spec.options)),
+                )
+
+
+class PlansTest(absltest.TestCase):
+    def test_measurements_of_plans(self):
+        """Two episodes of a controller that walks nowhere: they end early, without a goal."""
+        id_ = 'PD_Biped3D_HLC_PathFollowing-v0'
+
+        def make(environments):
+            return lambda observation: 0.0 * observation[:, :5] + 1.0  # too far for anybody
+
+        found = evaluate_plans.run(id_, make, episodes=2, seed=0)
+        self.assertEqual((found['survived'], found['survived_minute']), (0, 0))
+        self.assertEqual(found['goals_per_minute'], 0)
+        self.assertBetween(found['seconds'], 0.5, 20)
+        self.assertLess(found['reward'], 0.05)
+        self.assertGreater(found['falls_per_km'], 50)
+        self.assertEqual(found['at_goal'], 0)
+
+    def test_without_hierarchy(self):
+        """A walker that always acts at its limits falls at once; a step lasts 1/30 s."""
+        id_ = 'PD_Biped3D_Terrain_Soccer_Hard-v0'
+
+        def make(environments):
+            return lambda observation: np.ones((2, len(environments.action_map)))
+
+        found = evaluate_plans.run(id_, make, episodes=2, seed=0)
+        self.assertEqual(found['survived'], 0)
+        self.assertBetween(found['seconds'], 0.1, 5)
+        self.assertAlmostEqual(found['seconds'] * 60, round(found['seconds'] * 60), 6)
+        self.assertLess(found['reward'], found['seconds'] / evaluate_plans.SECONDS)
+
+    def test_policies_of_tasks(self):
+        planned, direct = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_Terrain_Forest_Hard-v0'
+        for id_, name, expected in (
+            (planned, 'expert', expert.expert),
+            (direct, 'expert', joint_expert.joint_expert),
+            (direct, 'scripted', None),
+            ('PD_Biped3D_HLC_Soccer-v0', 'expert', None),  # its footsteps have no expert
+        ):
+            self.assertIs(evaluate_plans.maker(id_, name), expected)
+
+
+class ExpertTest(parameterized.TestCase):
+    """The expert for footstep plans."""
+
+    def test_a_trail(self):
+        trail = SimpleNamespace(
+            start=np.array([[0.0, 0.0], [2.0, 0.0]]), end=np.array([[2.0, 0.0], [2.0, 2.0]])
+        )
+        for place, goal, ahead, expected in (
+            ((0.5, 0.1), (1.9, 0.0), 1.0, (1.5, 0.0)),
+            ((1.5, 0.1), (2.0, 1.9), 1.0, (2.0, 0.5)),  # around the corner
+            ((2.1, 0.5), (1.0, 0.0), 1.0, (1.5, 0.0)),  # back
+            ((1.5, 0.0), (1.7, 0.0), 1.0, (1.7, 0.0)),  # no farther than the goal
+        ):
+            aim = expert.on_trail(trail, np.array(place), np.array(goal), ahead)
+            np.testing.assert_allclose(aim + place, expected, atol=1e-9)
+
+    def test_past_a_goal_on_a_trail(self):
+        """The point is farther on, shifted sideways with a goal that is still ahead."""
+        trail = SimpleNamespace(start=np.array([[0.0, 0.0]]), end=np.array([[9.0, 0.0]]))
+        place = np.array([2.0, 0.3])
+        for goal, expected in (((2.5, 0.4), (3.5, 0.2)), ((1.0, 0.4), (3.5, 0.0))):
+            aim = expert.on_trail(trail, place, np.array(goal), 1.5, beyond=True)
+            np.testing.assert_allclose(aim + place, expected, atol=1e-9)
+
+    def test_a_path_on_a_map(self):
+        map_ = expert.Map()
+        x, y = map_.places.T
+        np.testing.assert_allclose(map_.places[map_.middle], 0)
+        self.assertEqual(np.abs(map_.places[map_.rim]).max(1).min(), expert.REACH)
+        even = np.ones(len(x))
+        for goal in ((3.0, 0.0), (0.0, -4.0), (-20.0, 0.0), (9.0, 4.0)):  # there is nothing
+            aim = map_.aim(even, np.array(goal))
+            np.testing.assert_allclose(aim, goal)
+        # A wall ahead that reaches farther to the right than to the left.
+        wall = (np.abs(x - 1) < 0.2) & (y < 1) & (y > -4)
+        aim = map_.aim(even + expert.WALL * wall, np.array([3.0, 0.0]))
+        self.assertGreater(aim[1], 0.6)
+        self.assertLess(np.linalg.norm(aim), 2.0)
+
+    @parameterized.parameters(
+        ('PD_Biped3D_HLC_Soccer-v0', {}),
+        ('PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}),
+        ('PD_Biped2D_Flat-v0', {}),
+    )
+    def test_expert_rejects_unsupported_tasks(self, id_, options):
+        environments = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
+        with self.assertRaisesRegex(ValueError, 'the expert does not support the task'):
+            expert.expert(environments)
+
+    @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
+    def test_expert_arrives_on_difficult_ground(self, name):
+        """20 s of 8 episodes, towards goals at the least speed required of trained policies."""
+        environments = VectorEnvironment(
+            f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled'
+        )
+        policy, observation = expert.expert(environments), environments.reset()
+        fell, speed = 0, np.zeros(8)
+        for _ in range(40):
+            action = policy(observation)
+            self.assertEqual(action.shape, (8, 5))
+            step = environments.step(action)
+            ended = step.terminated | step.truncated
+            fell += ended.sum()
+            speed += step.info['speed'] / 40
+            observation = environments.reset(ended) if ended.any() else step.observation
+        self.assertLessEqual(fell, 1)
+        self.assertGreater(speed.mean(), 0.6)
+
+
+class JointExpertTest(parameterized.TestCase):
+    """The expert for tasks without hierarchy."""
+
+    @parameterized.parameters('Trail', 'Blocks', 'Soccer')
+    def test_walks_on(self, name):
+        """10 s of 8 episodes: at most one fall, and the walkers leave their start."""
+        environments = VectorEnvironment(
+            f'PD_Biped3D_Terrain_{name}_Hard-v0',
+            8,
+            0,
+            seed=3,
+            autoreset='disabled',
+            step_limit=None,
+        )
+        policy, observation = joint_expert.joint_expert(environments), environments.reset()
+        fell, distance = 0, np.zeros(8)
+        for _ in range(300):
+            action = policy(observation)
+            self.assertEqual(action.shape, (8, len(environments.action_map)))
+            step = environments.step(action)
+            fell += step.terminated.sum()
+            distance = np.maximum(distance, step.info['distance'])
+            observation = (
+                environments.reset(step.terminated) if step.terminated.any() else step.observation
+            )
+        self.assertLessEqual(fell, 1)
+        self.assertGreater(distance.mean(), 1.0 if name == 'Soccer' else 5.0)
+
+    def test_plans_again_after_a_reset(self):
+        """A policy that has seen other episodes acts in a new one as a new policy does."""
+        environments = VectorEnvironment(
+            'PD_Biped3D_Terrain_Soccer_Hard-v0', 2, 0, seed=3, autoreset='disabled'
+        )
+        used, observation = joint_expert.joint_expert(environments), environments.reset()
+        for _ in range(20):
+            observation = environments.step(used(observation)).observation
+        observation = environments.reset()
+        fresh = joint_expert.joint_expert(environments)
+        np.testing.assert_array_equal(used(observation), fresh(observation))
+
+    def test_rejects_unsupported_tasks(self):
+        environments = VectorEnvironment('PD_Biped3D_HLC_Forest-v0', 1, 1, seed=0)
+        with self.assertRaisesRegex(ValueError, 'the joint expert does not support the task'):
+            joint_expert.joint_expert(environments)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,157 @@
+"""Evaluates footstep tracking of a footstep controller: plans, pushes, slopes, bumps, belts.
+
+    python training/evaluate_footsteps.py                           # the reference policy
+    python training/evaluate_footsteps.py mine.npz --filter general straight --json mine.json
+
+Prints for every condition, over episodes with the seeds of `evaluation.evaluate`: the share of
+episodes that last to the end, the mean reward per step (0 after a fall), the distance from planned
+to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
+heading error at landing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import types
+from typing import Any
+
+import numpy as np
+
+from trl_suite import policies, suite
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.util import files
+from trl_suite.util.program import begin_script
+from trl_suite.vector import VectorEnvironment
+
+ID = 'PD_Biped3D_LLC_General_Step-v0'
+SECONDS = 20.0  # of an episode
+STEADY = {'turn': 0.0, 'sharp': 0.0}
+VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'sharp': 0.0}
+PUSHES = {'force': (150, 150), 'duration': (0.2, 0.2), 'interval': (2.8, 2.8)}  # every 3 s
+BELTS = {
+    'Type': 'conveyor3d',
+    'Params': [{
+        'ObstacleWidth0': 2, 'ObstacleWidth1': 2, 'ObstacleSpeed0': 0.6, 'ObstacleSpeed1': 0.6,
+        'ConveyorStripLength': 200, 'ConveyorNumStrips': 20, 'ConveyorSpacing': 1,
+    }],
+}  # fmt: skip
+
+
+def ramp(slope: float) -> dict[str, Any]:
+    return {'Type': 'var3d_ramp', 'Params': [{'Slope': slope}]}
+
+
+def bumps(height: float) -> dict[str, Any]:
+    return {'Type': 'var3d_checkers', 'Params': [{'Slope': height}]}
+
+
+# Task options; `terrain` replaces that of the environment's spec.
+CONDITIONS: dict[str, dict[str, Any]] = {
+    'straight': {'plans': STEADY},
+    'straight, 0.3 m': {'plans': {**STEADY, 'length': (0.3, 0.3)}},
+    'straight, 0.7 m': {'plans': {**STEADY, 'length': (0.7, 0.7)}},
+    'general without sharp turns': {'plans': {'sharp': 0.0}},
+    'general': {'plans': {}},
+    'varied lengths and widths': {'plans': VARIED},
+    'made from the root': {'plans': {'from_root': 1.0}},
+    'made from the root, on the spot': {'plans': {'from_root': 1.0, 'root_length': (0.0, 0.0)}},
+    'made from the root, turning about': {'plans': {'from_root': 1.0, 'root_turn': 0.6}},
+    'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
+    'pushes of 250 N': {'plans': {'sharp': 0.0}, 'pushes': {**PUSHES, 'force': (250, 250)}},
+    'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
+    'ramp down 8 %': {'plans': STEADY, 'terrain': ramp(-0.08)},
+    'bumps of 3 cm': {'plans': {'sharp': 0.0}, 'terrain': bumps(0.03)},
+    'bumps of 6 cm': {'plans': {'sharp': 0.0}, 'terrain': bumps(0.06)},
+    'belts of 0.6 m/s': {'plans': {'sharp': 0.0}, 'terrain': BELTS},
+}
+
+
+def row_for(id_: str, terrain: Any) -> EnvSpec:
+    spec = suite.find(id_)
+    options = {k: v for k, v in spec.options.items() if k != 'plans'}
+    return dataclasses.replace(
+        spec, terrain=terrain or spec.terrain, options=types.MappingProxyType(options)
+    )
+
+
+def run(
+    spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
+) -> dict[str, Any]:
+    """Runs one episode in every simulation; returns survival, reward and tracking errors."""
+    steps = round(seconds * 30)
+    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
+    environments = VectorEnvironment(
+        spec, episodes, 0, seeds, autoreset='disabled', step_limit=steps, task_kwargs=options
+    )
+    policy.check(environments)
+    observation = environments.reset()
+    runs, reward = np.ones(episodes, bool), 0.0
+    full, distance = np.zeros(episodes, bool), np.zeros(episodes)
+    landing, heading = [], []
+    while runs.any():
+        step = environments.step(policy(observation))
+        reward += float(step.reward[runs].sum())
+        landed = step.info['landed'] & runs
+        landing.append(step.info['landing_error'][landed])
+        heading.append(step.info['heading_error'][landed])
+        ended = step.terminated | step.truncated
+        distance[ended & runs] = step.info['distance'][ended & runs]
+        full[ended & runs] = step.truncated[ended & runs]
+        runs &= ~ended
+        observation = step.observation
+        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
+            observation = environments.reset(ended)
+    environments.close()
+    errors, turns = np.concatenate(landing), np.concatenate(heading)
+    return {
+        'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
+        'normalized_return': reward / (steps * episodes), 'landing': float(errors.mean()),
+        'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
+        'distance': float(distance.mean()),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('policy', nargs='?', help='.npz file; the reference policy by default')
+    parser.add_argument('--id', default=ID)
+    parser.add_argument(
+        '--variant', default='', choices=('', *policies.VARIANTS), help='of the reference policy'
+    )
+    parser.add_argument('--filter', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
+    parser.add_argument('--episodes', type=int, default=100)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seconds', type=float, default=SECONDS)
+    parser.add_argument('--json', type=pathlib.Path)
+    arguments = parser.parse_args()
+    if arguments.policy and arguments.variant:
+        parser.error('give either a file or --variant, not both')
+    policy = (
+        policies.load(arguments.policy)
+        if arguments.policy
+        else suite.reference_policy(arguments.id, arguments.variant)
+    )
+    found = {}
+    for name in arguments.filter:
+        options = dict(CONDITIONS[name])
+        row = row_for(arguments.id, options.pop('terrain', None))
+        found[name] = result = run(
+            row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
+        )
+        print(
+            f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '
+            f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
+            f'heading {result["heading"]:.3f} rad',
+            flush=True,
+        )
+    if arguments.json:
+        with files.replacing(arguments.json) as part:
+            part.write_text(json.dumps({'id': arguments.id, 'conditions': found}, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

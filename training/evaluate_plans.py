@@ -1,0 +1,156 @@
+"""Evaluates navigation tasks: scripted and learnt footstep planning, and control without hierarchy.
+
+    python training/evaluate_plans.py                                      # all, both policies
+    python training/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 32
+
+Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds
+of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
+without a fall, in total and in the first minute, speed towards the goal, goals per minute (not in
+soccer), distance along a trail, the share of time with the ball at its goal, and falls per
+kilometre. `expert` is the expert that policies imitate, for footsteps (not in soccer) or joint targets.
+Environments without hierarchy have no scripted policy; their episodes are as long as the others.
+Writes the results to trained/plans.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from expert import expert
+from joint_expert import joint_expert
+
+from trl_suite import policies
+from trl_suite.registry import catalogue
+from trl_suite.tasks.navigation.scripted import scripted
+from trl_suite.tasks.task import CONTROL_TIMESTEP
+from trl_suite.util import errors, files, resources
+from trl_suite.util.program import begin_script
+from trl_suite.vector import VectorEnvironment
+
+EPISODES = 128
+POLICIES = ('scripted', 'reference', 'expert')
+TAGS = ('hierarchical', 'flat_control')  # of the environments with goals
+SECONDS = 200.0  # of an episode without hierarchy
+SEGMENT = 2.0  # m; of a trail
+MINUTE = 60.0  # s
+
+
+def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarray:
+    """Returns the distances of positions (n, 2) along their trails, (n,) m; 0 without a trail."""
+    found = np.zeros(len(place))
+    for env_id, ground in enumerate(environments.task.arena.grounds):
+        if ground.layout.trail is not None:
+            trail = ground.layout.trail
+            middle = 0.5 * (trail.start + trail.end)
+            found[env_id] = SEGMENT * np.linalg.norm(middle - place[env_id], axis=1).argmin()
+    return found
+
+
+def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int) -> dict:
+    """Runs one episode in every simulation; returns the measured quantities."""
+    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
+    own = 'hierarchical' in catalogue.BY_ID[id_].tags
+    limit = -1 if own else round(SECONDS / CONTROL_TIMESTEP)
+    environments = VectorEnvironment(
+        id_, episodes, 0, seeds, step_limit=limit, autoreset='disabled'
+    )
+    policy, observation = make(environments), environments.reset()
+    task, limit = environments.task, environments.step_limit
+    assert limit is not None
+    duration = np.full(episodes, CONTROL_TIMESTEP)  # s; of a step without hierarchy
+    root = task.figure.links[0]
+
+    def places() -> np.ndarray:
+        return task.world.xpos[:, root, :2].copy()
+
+    runs, fell = np.ones(episodes, bool), np.zeros(episodes, bool)
+    reward, seconds, towards, path, goals, arrived = np.zeros((6, episodes))
+    before = places()
+    begin = along_trails(environments, before)
+    trail = np.zeros(episodes)
+    while runs.any():
+        step = environments.step(policy(observation))
+        info, after = step.info, places()
+        reward += step.reward * runs
+        duration = info.get('duration', duration)
+        seconds += duration * runs
+        towards += info['speed'] * duration * runs
+        path += np.linalg.norm(after - before, axis=1) * runs
+        arrived += info.get('at_goal', np.zeros(episodes)) * duration * runs
+        if 'at_goal' not in info:
+            goals[runs] = info['goals_reached'][runs]
+        ended = step.terminated | step.truncated
+        if (ended & runs).any():
+            last = along_trails(environments, after) - begin
+            trail[ended & runs] = last[ended & runs]
+        fell |= step.terminated & runs
+        runs &= ~ended
+        observation, before = step.observation, after
+        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
+            observation = environments.reset(ended)
+            before = places()
+    environments.close()
+    return {
+        'episodes': episodes, 'seed': seed, 'reward': float(reward.mean() / limit),
+        'survived': float(1 - fell.mean()),
+        'survived_minute': float(1 - (fell & (seconds < MINUTE)).mean()), 'seconds': float(seconds.mean()),
+        'speed': float(towards.sum() / seconds.sum()),
+        'goals_per_minute': float(60 * goals.sum() / seconds.sum()),
+        'trail': float(np.median(trail)), 'at_goal': float(arrived.sum() / seconds.sum()),
+        'falls_per_km': float(1000 * fell.sum() / path.sum()),
+    }  # fmt: skip
+
+
+def maker(id_: str, name: str) -> Callable[[VectorEnvironment], Any] | None:
+    """Returns a function that makes one of `POLICIES`; None if the environment does not have it."""
+    spec = catalogue.BY_ID[id_]
+    planned = 'hierarchical' in spec.tags
+    if name == 'scripted':
+        return scripted if planned else None
+    if name == 'expert':
+        if not planned:
+            return joint_expert
+        return None if spec.task_type == 'soccer' else expert
+    try:
+        policy = policies.reference(id_)
+    except FileNotFoundError:
+        return None
+    return lambda environments: policy
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('pattern', nargs='?', default='PD_Biped3D_*', help='of ids')
+    parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
+    parser.add_argument('--episodes', type=int, default=EPISODES)
+    parser.add_argument('--seed', type=int, default=0)
+    arguments = parser.parse_args()
+    ids = [
+        spec.id
+        for spec in catalogue.SPECS
+        if spec.tags.intersection(TAGS) and fnmatch.fnmatchcase(spec.id, arguments.pattern)
+    ]
+    if not ids:
+        raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
+    path = resources.directory('trained') / 'plans.json'
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    for id_ in ids:
+        for name in arguments.policies:
+            make = maker(id_, name)
+            if make is None:
+                continue
+            result = run(id_, make, arguments.episodes, arguments.seed)
+            found.setdefault(id_, {})[name] = result
+            print(id_, name, {k: round(v, 3) for k, v in result.items()}, flush=True)
+            with files.replacing(path) as part:
+                part.write_text(json.dumps(found, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

@@ -1,0 +1,112 @@
+"""Evaluates a trained gait policy on other terrains of its character, and ships it where it is better.
+
+    python training/share_gaits.py FSM_Dog2D_Terrain_Mixed-v0 FSM_Dog2D_Terrain_Gaps-v0
+    python training/share_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 FSM_Raptor2D_Terrain_Slopes-v0 \
+        --preferences 0 1
+
+Observation and action are the same on all terrains. The other environments get the policy of the first
+id if its mean distance is above the 95 % interval of their shipped policy. One without a policy gets it if
+its mean distance is not below the interval of the default gait. Of several preferences of the default
+gait (`Policy.with_preference`) the best one is used, measured with another seed.
+
+Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
+environment in which it was trained; `preference`, if it is not 0; `evaluation`, its results; and `before`,
+the results of the shipped policy or the default gait that it replaces.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import ppo
+import train_all
+
+from trl_suite import evaluation, policies
+from trl_suite.util import files, resources
+from trl_suite.util.program import begin_script
+
+
+def stored(id_: str, episodes: int) -> dict[str, Any] | None:
+    """Returns the results of the shipped policy, if it was evaluated in as many episodes."""
+    trained = resources.directory('trained')
+    shared = trained / policies.SHARED
+    entries = json.loads(shared.read_text()) if shared.exists() else {}
+    own = trained / f'{id_}.json'
+    if id_ in entries:
+        found = entries[id_]['evaluation']
+    elif own.exists():
+        found = train_all.shipped(json.loads(own.read_text()))['evaluation']
+    else:
+        return None
+    asked = {'episodes': episodes, 'seed': train_all.SEED}
+    return found if {name: found[name] for name in asked} == asked else None
+
+
+def preferring(
+    id_: str, policy: policies.Policy, preferences: Sequence[float], episodes: int, threads: int
+) -> tuple[float, policies.Policy]:
+    """Returns the best preference of the default gait in an environment, and the policy with it."""
+    found = {each: policy.with_preference(each) if each else policy for each in preferences}
+    if len(found) == 1:
+        return next(iter(found.items()))
+
+    def distance(candidate: tuple[float, policies.Policy]) -> float:
+        result = evaluation.evaluate(id_, candidate[1], episodes, ppo.EVALUATION_SEED, threads)
+        print(f'{id_}: preference {candidate[0]:g}: {result["distance"]:.1f} m', flush=True)
+        return result['distance']
+
+    return max(found.items(), key=distance)
+
+
+def remove_unused(shared: dict[str, Any]) -> None:
+    """Removes the policies of environments that use another one, unless others use theirs."""
+    for id_ in shared.keys() - {entry['policy'] for entry in shared.values()}:
+        for suffix in ('npz', 'json'):
+            (resources.directory('trained') / f'{id_}.{suffix}').unlink(missing_ok=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('policy', metavar='ID', help='environment of the policy')
+    parser.add_argument(
+        'ids', nargs='+', metavar='ID', help='environments in which it is evaluated'
+    )
+    parser.add_argument('--episodes', type=int, default=train_all.GAIT_EPISODES)
+    parser.add_argument('--preferences', type=float, nargs='+', default=[0.0])
+    parser.add_argument('--threads', type=int, default=1, help='0: all cores')
+    arguments = parser.parse_args()
+    path = resources.directory('trained') / policies.SHARED
+    for id_ in arguments.ids:
+        options = arguments.episodes, train_all.SEED, arguments.threads
+        before, has_policy = stored(id_, arguments.episodes), id_ in policies.available()
+        if before is None and has_policy:
+            before = evaluation.evaluate(id_, policies.reference(id_), *options)
+        elif before is None:
+            before = evaluation.evaluate(id_, evaluation.zero, *options, factory=True)
+        preference, policy = preferring(
+            id_, policies.reference(arguments.policy), arguments.preferences, arguments.episodes,
+            arguments.threads,
+        )  # fmt: skip
+        found = evaluation.evaluate(id_, policy, *options)
+        print(
+            f'{id_}: {found["distance"]:.1f} m, median {found["median_distance"]:.1f} m; '
+            f'before: {before["distance"]:.1f} m, median {before["median_distance"]:.1f} m',
+            flush=True,
+        )
+        low, high = before['distance_interval']
+        if found['distance'] <= (high if has_policy else low):
+            continue
+        shared = json.loads(path.read_text()) if path.exists() else {}
+        entry = {'policy': arguments.policy, **({'preference': preference} if preference else {})}
+        shared[id_] = {**entry, 'evaluation': found, 'before': before}
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(dict(sorted(shared.items()))) + '\n')
+        remove_unused(shared)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

@@ -1,0 +1,403 @@
+"""Trains the reference policies of all environments, some with three seeds.
+
+    python training/train_all.py                       # all missing runs, two at a time
+    python training/train_all.py --filter '*Dog2D*' --jobs 8
+    python training/train_all.py --filter PD_Dog2D_Gaps_Terrain-v0 --overwrite
+    python training/train_all.py --filter FSM_Goat2D_Terrain_Cliffs-v0
+    python training/train_all.py --ray                 # on all cores, or on those of a cluster
+
+Each run is `training/ppo.py` on one thread, or for gait environments (FSM_...)
+`training/learn_gaits.py` or `training/refine_gaits.py`. A run that uses the policy of another environment, as initial policy or as footstep controller, starts after the runs
+of that environment.
+Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
+into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
+becomes `trained/ID.npz`. Runs that have been entered with the same settings are not repeated.
+The environment variable TRL_SUITE_TRAINED selects another folder than `trained`. By default
+the gait environments in `GAITS` are trained; others must be selected by their full ids.
+
+With `--ray` each run is a task of Ray (`docs/cluster.md`) and gives the same numbers. RUNS is then
+a folder or a URL that all machines reach; a run whose machine is lost continues on another one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import contextlib
+import dataclasses
+import fnmatch
+import json
+import os
+import pathlib
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import checkpoints
+import learn_gaits
+import numpy as np
+import ppo
+import refine_gaits
+import tqdm
+
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.util import errors, files, resources
+from trl_suite.util.program import begin_script
+
+EPISODES, SEED = 50, 0  # of the published evaluation
+GAIT_EPISODES = 200  # the standard deviation of the distance before a fall is as large as its mean
+SEEDS = (1,)
+COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
+ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # a row of the table of runs
+MEMORY = 1.5e9  # bytes of memory that Ray reserves for a run
+GAITS = (  # gait environments that are trained by default
+    'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
+    'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
+    'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
+    'FSM_Dog2D_Terrain_Stairs_Rugged-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
+)  # fmt: skip
+
+# Gait environments whose policies refine_gaits.py improves: of these, or of the environment from
+# which they start.
+REFINED = (
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
+    'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
+    'FSM_Hopper2D_Terrain_Mixed-v0',
+)  # fmt: skip
+
+
+def compared(spec: catalogue.EnvSpec) -> bool:
+    """Returns whether an environment is part of the comparison of actuation models."""
+    return spec.domain == 'imitation' and 'planar' in spec.tags and '_Run_' not in spec.id
+
+
+def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
+    """Returns the runs to do: one per environment first, then further seeds."""
+    ids = [
+        id_
+        for id_, spec in catalogue.BY_ID.items()
+        if id_ == pattern
+        or (fnmatch.fnmatchcase(id_, pattern) and (spec.actuation != 'gait' or id_ in GAITS))
+    ]
+    if not ids:
+        raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
+    seeds = {id_: COMPARED_SEEDS if compared(catalogue.BY_ID[id_]) else SEEDS for id_ in ids}
+    found = [(id_, seed) for id_ in ids for seed in seeds[id_] if seed in only_seeds]
+    return sorted(found, key=lambda job: (job[1], depth(job[0])))  # sorting is stable
+
+
+def shipped(entry: dict[str, Any]) -> dict[str, Any]:
+    """Returns the run of `trained/ID.json` whose policy is in `trained/ID.npz`."""
+    return next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
+
+
+def program(id_: str) -> ModuleType:
+    """Returns the program that trains an environment."""
+    if catalogue.BY_ID[id_].actuation != 'gait':
+        return ppo
+    return refine_gaits if id_ in REFINED else learn_gaits
+
+
+def start_of(id_: str) -> str | None:
+    """Returns the initial policy of the training of an environment, if any."""
+    own = program(id_).settings_for(id_)
+    return getattr(own, 'start', '') or getattr(getattr(own, 'first', own), 'start', None)
+
+
+def needed(id_: str) -> list[str]:
+    """Returns the environments whose policies a run uses: initial policy, footstep controller."""
+    spec = catalogue.BY_ID[id_]
+    default = getattr(TASK_TYPES[spec.task_type].config(), 'controller', None)
+    found = (start_of(id_), spec.options.get('controller', default))
+    return [other for other in found if other in catalogue.BY_ID]
+
+
+def depth(id_: str) -> int:
+    """Returns the length of the longest chain of environments that must be trained before this one."""
+    return max((1 + depth(other) for other in needed(id_)), default=0)
+
+
+def entries(id_: str) -> list[dict[str, Any]]:
+    """Returns the runs that have been entered for an environment."""
+    path = resources.directory('trained') / f'{id_}.json'
+    if not path.exists():
+        return []
+    runs = json.loads(path.read_text())['runs']
+    default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
+    for run in runs:  # new settings get their defaults, removed ones are dropped
+        run['settings'] = own = {
+            name: run['settings'].get(name, value) for name, value in default.items()
+        }
+        if 'first' in default:
+            first = default['first'].items()
+            own['first'] = {name: own['first'].get(name, value) for name, value in first}
+    return runs
+
+
+def changes(samples: float | None) -> dict[str, float]:
+    """Returns the settings that an option `--samples` changes."""
+    return {} if samples is None else {'samples': samples}
+
+
+def settings(id_: str, samples: float | None = None) -> dict[str, Any]:
+    """Returns the settings of an environment as read from JSON."""
+    own = program(id_).settings_for(id_, **changes(samples))
+    return json.loads(json.dumps(dataclasses.asdict(own)))
+
+
+class Run(NamedTuple):
+    """A run that is finished.
+
+    Attributes:
+      entry: settings, learning curve and evaluation, for `trained/ID.json`.
+      policy: its policy, for `trained/ID.npz`.
+      host: name of the machine.
+      seconds: duration of training and evaluation, s; without earlier attempts.
+    """
+
+    entry: dict[str, Any]
+    policy: policies.Policy
+    host: str
+    seconds: float
+
+
+def train(id_: str, seed: int, runs: pathlib.Path, samples: float | None, machine: str) -> Run:
+    """Trains in a separate process, and evaluates."""
+    begin = time.monotonic()
+    script = pathlib.Path(program(id_).__file__ or '')
+    command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={runs}']
+    if samples is not None:
+        command.append(f'--samples={samples}')
+    folder = runs / id_ / f'seed_{seed}'
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / 'log.txt', 'a') as log:
+        subprocess.run(command, check=True, stdout=log, stderr=log)
+    return measured(id_, folder, machine, begin)
+
+
+def train_here(
+    id_: str, seed: int, settings: Any, url: str, given: dict[str, bytes], machine: str
+) -> Run:
+    """Trains in this process, one of Ray's, from the checkpoint in a store; and evaluates.
+
+    Args:
+      id_: the environment.
+      seed: the seed.
+      settings: the settings.
+      url: folder or URL where the files of the run are kept.
+      given: files of the folder `trained` that the run reads.
+      machine: description of the machine, for the results; '' for that of this one.
+    """
+    import storage  # needs fsspec
+
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder, trained = (pathlib.Path(scratch, name) for name in ('run', 'trained'))
+        for each in (folder, trained):
+            each.mkdir()
+        for name, content in given.items():
+            (trained / name).write_bytes(content)
+        os.environ['TRL_SUITE_TRAINED'] = str(trained)
+        with (
+            storage.kept(folder, url),
+            open(folder / 'log.txt', 'a') as log,
+            contextlib.redirect_stdout(log),
+            contextlib.redirect_stderr(log),
+        ):
+            how = 'continues' if any(folder.rglob(storage.CHECKPOINT)) else 'begins'
+            print(f'{time.asctime()}: {how} on {platform.node()}', flush=True)
+            program(id_).train(id_, seed, settings, folder, threads=1)
+        return measured(id_, folder, machine, begin)
+
+
+def given(id_: str) -> dict[str, bytes]:
+    """Returns the files of `trained` that a run reads, for `train_here`."""
+    shipped = policies.available()
+    used = {other: policies.trained_for(other) for other in (*needed(id_), id_) if other in shipped}
+    trained = resources.directory('trained')
+    found = {f'{other}.npz': (trained / f'{other}.npz').read_bytes() for other in used.values()}
+    shared = {
+        id_: {'policy': other, 'preference': policies.preference_for(id_)}
+        for id_, other in used.items()
+        if id_ != other
+    }
+    return {**found, policies.SHARED: json.dumps(shared).encode()}
+
+
+def trimmed(policy: policies.Policy) -> policies.Policy:
+    """Returns the policy for a small file.
+
+    Weights are rounded to half precision, and inputs that are always 0 are removed, for example the
+    footstep of the stance foot.
+    """
+    if policy.convolution is not None:  # the inputs of a convolution cannot be removed
+        line = policy.convolution
+        line = dataclasses.replace(line, weights=_rounded(line.weights))
+        return dataclasses.replace(policy, convolution=line, weights=_rounded(policy.weights))
+    kept = (policy.mean != 0) | (policy.std > ppo.LEAST_STD)
+    columns = np.arange(len(kept)) if policy.columns is None else policy.columns
+    weights = (policy.weights[0][kept], *policy.weights[1:])
+    return dataclasses.replace(
+        policy, columns=columns[kept], mean=policy.mean[kept], std=policy.std[kept],
+        weights=_rounded(weights),
+    )  # fmt: skip
+
+
+def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
+    return tuple(w.astype(np.float16).astype(w.dtype) for w in weights)
+
+
+def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
+    """Evaluates a run; `begin` is the time of `time.monotonic` at its start."""
+    curve = json.loads((folder / 'curve.json').read_text())
+    settings = curve['settings']
+    # The last policy is used with curriculum stages, because the curve does not measure all skills,
+    # and if it only imitates, because it has learnt from the most data.
+    imitates = settings.get('cloned', 0) >= settings['samples']
+    name = 'last' if settings.get('stages') or imitates else 'policy'
+    policy = trimmed(policies.load(folder / f'{name}.npz'))
+    episodes = GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
+    found = evaluation.evaluate(id_, policy, episodes, SEED, num_threads=1)
+    machine = machine or f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
+    entry = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
+    return Run(entry, policy, platform.node(), time.monotonic() - begin)
+
+
+def enter(id_: str, seed: int, run: Run) -> None:
+    """Enters a run into the file of its environment."""
+    own = run.entry
+    others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == own['settings']]
+    every = sorted([own, *others], key=lambda r: r['seed'])
+    best = max(every, key=lambda r: r['evaluation']['return'])
+    trained = resources.directory('trained')
+    trained.mkdir(parents=True, exist_ok=True)
+    if best is own:
+        policies.save(run.policy, trained / f'{id_}.npz')
+    with files.replacing(trained / f'{id_}.json') as part:
+        part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
+    shared = trained / policies.SHARED
+    used = json.loads(shared.read_text()) if shared.exists() else {}
+    if id_ in used and used[id_]['evaluation']['return'] < best['evaluation']['return']:
+        del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
+        with files.replacing(shared) as part:
+            part.write_text(json.dumps(used) + '\n')
+
+
+def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callable[[str, int], Run]:
+    """Returns a function that trains by a task of Ray."""
+    import storage
+
+    from trl_suite.adapters.ray import RayExecutor
+
+    url = storage.absolute(arguments.runs)
+    executor = stack.enter_context(
+        RayExecutor(arguments.address, num_cpus=1, memory=int(MEMORY), fresh=True)
+    )
+
+    def work(id_: str, seed: int) -> Run:
+        place = f'{url}/{id_}/seed_{seed}'
+        if arguments.overwrite:
+            storage.remove(place)
+        own = program(id_).settings_for(id_, **changes(arguments.samples))
+        values = id_, seed, own, place, given(id_), arguments.machine
+        [run] = executor.map(train_here, *([value] for value in values))
+        return run
+
+    return work
+
+
+def in_processes(arguments: argparse.Namespace) -> Callable[[str, int], Run]:
+    """Returns a function that trains in a process of this machine."""
+
+    def work(id_: str, seed: int) -> Run:
+        runs = pathlib.Path(arguments.runs)
+        folder = runs / id_ / f'seed_{seed}'
+        if arguments.overwrite and folder.exists():
+            with checkpoints.only_run(folder):  # not while another process trains there
+                shutil.rmtree(folder)
+        return train(id_, seed, runs, arguments.samples, arguments.machine)
+
+    return work
+
+
+def parsed(words: Sequence[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--filter', default='*', metavar='PATTERN', help='of ids')
+    parser.add_argument('--seeds', type=int, nargs='+', default=COMPARED_SEEDS, help='only these')
+    parser.add_argument('--jobs', type=int, default=2, help='number of runs at a time, without Ray')
+    parser.add_argument('--runs', default='runs', help='folder; with Ray also a URL of fsspec')
+    parser.add_argument('--samples', type=float, help='of every run, instead of its own setting')
+    parser.add_argument(
+        '--overwrite', action='store_true', help='repeat runs that have been entered'
+    )
+    parser.add_argument('--ray', action='store_true', help='train by tasks of Ray')
+    parser.add_argument(
+        '--address', help="of Ray: 'auto', or HOST:PORT; default: this machine's cluster, or itself"
+    )
+    parser.add_argument('--machine', default='', help='description of the machine in the results')
+    return parser.parse_args(words)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    arguments = parsed(words)
+    todo = []
+    for id_, seed in jobs(arguments.filter, arguments.seeds):
+        own = settings(id_, arguments.samples)
+        entered = any(r['seed'] == seed and r['settings'] == own for r in entries(id_))
+        if arguments.overwrite or not entered:
+            todo.append((id_, seed))
+    entering = threading.Lock()  # two seeds of one environment write the same file
+    failed = 0
+    with contextlib.ExitStack() as stack:
+        done_by = on_ray(arguments, stack) if arguments.ray else in_processes(arguments)
+        # Ray decides how many runs there are at a time.
+        number = max(len(todo), 1) if arguments.ray else arguments.jobs
+        pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(number))
+        bar = stack.enter_context(tqdm.tqdm(total=len(todo), unit='run'))
+
+        def work(id_: str, seed: int, before: list[concurrent.futures.Future]) -> Run:
+            concurrent.futures.wait(before)
+            if any(future.exception() for future in before):
+                raise RuntimeError('not trained, since a run failed whose policy it uses')
+            run = done_by(id_, seed)
+            with entering:
+                enter(id_, seed, run)
+            return run
+
+        running: dict[concurrent.futures.Future, tuple[str, int]] = {}
+        for job in todo:  # each waits only for runs that were submitted before
+            others = needed(job[0])
+            before = [future for future, (id_, _) in running.items() if id_ in others]
+            running[pool.submit(work, *job, before)] = job
+        bar.write(ROW.format('environment', 'seed', 'machine', 'minutes', 'return', 'complete'))
+        for done in concurrent.futures.as_completed(running):
+            id_, seed = running[done]
+            try:
+                run = done.result()
+            except Exception as error:  # the other runs continue
+                failed += 1
+                bar.write(f'{id_:40} {seed:4}  {type(error).__name__}: {error}')
+            else:
+                found = run.entry['evaluation']
+                values = f'{found["normalized_return"]:.3f}', f'{found["completion_rate"]:.0%}'
+                bar.write(ROW.format(id_, seed, run.host, f'{run.seconds / 60:.1f}', *values))
+            bar.update()
+    if failed:
+        raise RuntimeError(f'{failed} of {len(todo)} runs failed')
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

@@ -1,0 +1,146 @@
+"""Trains shipped policies further in worlds and with sensors that vary, for `trained/randomized`.
+
+    python training/train_randomized.py                       # all that are missing
+    python training/train_randomized.py Torque_Dog2D_LLC_Imitate_Flat-v0 --overwrite
+    python training/train_randomized.py --page docs/realism_worlds.md  # also writes its table
+
+Each run is `training/ppo.py` on one thread, with the settings `RANDOMIZED` of `ppo_settings.py`,
+starting from the shipped policy. Interrupted runs continue from their checkpoints in RUNS. The policy
+with the best score of the learning curve, whose evaluations have the same disturbances, becomes
+`trained/randomized/ID.npz`. It and the shipped policy are then evaluated without disturbances
+and with each preset of both `randomize` and `sensors`, in the same episodes, and settings, curve and
+results are written to `trained/randomized/ID.json`. The environment variable TRL_SUITE_TRAINED selects
+another folder than `trained`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import platform
+import shutil
+from typing import Any
+
+import ppo
+import ppo_settings
+import tqdm
+from train_all import SEED, trimmed
+
+from trl_suite import evaluation, policies
+from trl_suite.util import errors, files, resources
+from trl_suite.util.program import begin_script
+
+EPISODES = 64  # of each evaluation
+CONDITIONS: dict[str, dict[str, Any]] = {
+    'none': {},
+    **{name: {'randomize': name, 'sensors': name} for name in ('mild', 'robot', 'harsh')},
+}
+RESULTS = ('return', 'return_interval', 'completion_rate', 'distance', 'episodes', 'seed')
+_MARK, _END = '<!-- randomized, written by training/train_randomized.py -->', '<!-- /randomized -->'
+
+
+def place(id_: str) -> pathlib.Path:
+    """Returns the path of the results of an environment; the policy is beside it, as .npz."""
+    return resources.directory('trained') / 'randomized' / f'{id_}.json'
+
+
+def write(entry: dict[str, Any]) -> None:
+    """Writes the results of an environment."""
+    with files.replacing(place(entry['id'])) as part:
+        part.write_text(json.dumps(entry) + '\n')
+
+
+def train(id_: str, seed: int, runs: pathlib.Path) -> None:
+    """Trains, and writes the policy with settings and curve."""
+    folder = runs / id_ / f'seed_{seed}'
+    settings = ppo_settings.randomized_settings_for(id_)
+    ppo.train(id_, seed, settings, folder, threads=1)
+    policy = trimmed(policies.load(folder / 'policy.npz'))
+    place(id_).parent.mkdir(parents=True, exist_ok=True)
+    policies.save(policy, place(id_).with_suffix('.npz'))
+    machine = f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
+    curve = json.loads((folder / 'curve.json').read_text())
+    write({**curve, 'machine': machine, 'shipped_at': policy.info['samples']})
+
+
+def measure(id_: str) -> dict[str, Any]:
+    """Evaluates where results are missing, and writes them; returns all results of an environment."""
+    entry = json.loads(place(id_).read_text())
+    for name, variant in (('evaluations', 'randomized'), ('before', '')):
+        found = entry.setdefault(name, {})
+        for condition, options in CONDITIONS.items():
+            if condition not in found:
+                policy = policies.reference(id_, variant)
+                result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
+                found[condition] = {key: result[key] for key in RESULTS}
+                write(entry)
+    return entry
+
+
+def preset(entry: dict[str, Any]) -> str:
+    """Returns the preset with which a policy was trained."""
+    return str(entry['settings']['evaluated_with']['randomize'])
+
+
+def table(entries: list[dict[str, Any]]) -> str:
+    """Returns the results as Markdown."""
+    episodes = [
+        result['episodes']
+        for entry in entries
+        for name in ('evaluations', 'before')
+        for result in entry[name].values()
+    ]
+    lines = [
+        f'Mean returns of {min(episodes)} to {max(episodes)} episodes with 95 % confidence, and in brackets the share of '
+        'complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` what the '
+        'training has cost without disturbances.',
+        '',
+        '| environment | policy | none | mild | robot | harsh | robot / none | none / shipped |',
+        '|---|---|---|---|---|---|---|---|',
+    ]
+    for entry in entries:
+        shipped = entry['before']['none']['return']
+        titles = {'before': 'shipped', 'evaluations': f'randomized, `{preset(entry)}`'}
+        for name, title in titles.items():
+            found = entry[name]
+            cells = ' | '.join(
+                f'{each["return"]:.1f} ± {each["return_interval"]:.1f} ({each["completion_rate"]:.0%})'
+                for each in (found[condition] for condition in CONDITIONS)
+            )
+            none, robot = (found[condition]['return'] for condition in ('none', 'robot'))
+            id_ = f'`{entry["id"]}`' if name == 'before' else ''
+            lines.append(
+                f'| {id_} | {title} | {cells} | {robot / none:.2f} | {none / shipped:.2f} |'
+            )
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('ids', nargs='*', metavar='ID', default=list(ppo_settings.RANDOMIZED))
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/randomized'))
+    parser.add_argument('--overwrite', action='store_true', help='repeat runs that are entered')
+    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
+    arguments = parser.parse_args()
+    for id_ in arguments.ids:
+        if id_ not in ppo_settings.RANDOMIZED:
+            raise ValueError(errors.unknown('environment', id_, ppo_settings.RANDOMIZED))
+    entries = []
+    for id_ in tqdm.tqdm(arguments.ids, unit='run'):
+        if arguments.overwrite:
+            shutil.rmtree(arguments.runs / id_ / f'seed_{arguments.seed}', ignore_errors=True)
+        if arguments.overwrite or not place(id_).exists():
+            train(id_, arguments.seed, arguments.runs)
+        entries.append(measure(id_))
+    text = table(entries)
+    print(text)
+    if arguments.page is not None:
+        files.replace_between(arguments.page, _MARK, _END, text)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

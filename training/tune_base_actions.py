@@ -1,0 +1,471 @@
+"""Searches for gaits that pass obstacles at which a character's other gaits fall.
+
+    python training/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
+    python training/tune_base_actions.py goat --terrain cliffs_rugged --alone
+    python training/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
+    python training/tune_base_actions.py hopper --steady 1.4 --generations 60
+    python training/tune_base_actions.py hopper --score mixed_hopper
+
+For each terrain, in the order given, the gaits found so far run over it until they fall, and the states
+one to three cycles before these falls are stored. The score of a gait in a state is the distance
+travelled with that gait for one cycle (two if the legs change roles each cycle) and the default gait in
+the next cycles, divided by `USUAL` times the distance of as many cycles of the default gait on flat
+ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best
+gait. CMA-ES (Hansen 2016, arXiv:1604.00772) searches for the gait that increases the score of the set
+most. The stored scores are those in states that were not used by the search.
+
+With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
+travelled, divided by the distance at the target speed.
+
+With `--within` only gaits that an action can set are searched for. A policy can select them without
+a change of the base actions, and so of the action range: `--add` stores them in the character's file, and
+`learn_gaits.py` reads them with its setting `gaits`.
+
+With `--steady LENGTH` a gait is searched for with cycles of at least this length whose landing place
+depends as little as possible on the state, so that a policy can foresee it: after `SETTLED` cycles on
+flat ground the joint angles (and slides) of copies of a simulation are changed at random, and the
+score is high where the copies are still close together one to `AHEAD` cycles later. Falls, cycles that
+are shorter, and speeds far from the target speed reduce it.
+
+Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
+gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`. `--score`
+measures the base actions that were not found by a search, and writes their scores into this file.
+Needs `pip install 'trl_suite[tune]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import tune_gait
+
+from trl_suite import controllers
+from trl_suite.controllers import Parameters
+from trl_suite.util import errors, files
+from trl_suite.util.program import begin_script
+
+BACK = 3  # largest number of cycles from a state to the fall
+AFTER = 3  # cycles with the default gait after those with the candidate
+USUAL = 0.8  # share of the distance on flat ground that gives the full score
+OTHERS = 0.3  # share of the cycles before a fall with a gait drawn from all, instead of the first
+HORIZON = 8.0  # s, with `--alone`
+STATES, VALIDATION = 32, 64  # numbers of states for the search, and for the stored scores
+STARTS = 6  # number of noisy starts; twice as many with `--steady`
+FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
+FRICTION = 0.81
+# With `--steady`: cycles before and after the change; copies of each start; standard deviation of the
+# change, rad (slides: m); spread that counts as none, m; tolerance of the speed, m/s.
+SETTLED, AHEAD, COPIES, CHANGE, CLOSE, SPEED_TOLERANCE = 4, 3, 4, 0.02, 3e-3, 0.6
+# Weights of falls, of missing length (1/m) and of the speed (s/m) in the score.
+FALLS, LENGTH, SPEED = 3.0, 2.0, 0.3
+DIGITS = 4
+HAND = 'by hand'  # how sets were found that no search has found
+
+
+class Obstacles:
+    """Simulations of one character on one terrain.
+
+    Attributes:
+      default: gait after the candidate, (P,).
+      usual: distance of the default gait on flat ground in as many cycles, times `USUAL`, m.
+    """
+
+    def __init__(self, gait: Parameters, terrain: str, default: np.ndarray, num_envs: int) -> None:
+        self.gait, self.default = gait, default
+        self.lead = 2 if gait.kind == 'stride' else 1
+        self.bench = tune_gait.Bench(gait.character, num_envs, gait.action_offset, terrain)
+        self.bench.environments.reset()
+        flat = tune_gait.Bench(gait.character, STARTS, gait.action_offset)
+        runs = tune_gait.measure(flat, default, [FRICTION])
+        flat.environments.close()
+        self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
+
+    def collect(
+        self, vectors: np.ndarray, count: int, rng: np.random.Generator
+    ) -> list[dict[str, Any]]:
+        """Returns states shortly before falls of gaits (k, P), of which mostly the first one runs."""
+        environments = self.bench.environments
+        environments.seed(int(rng.integers(2**32)))
+        environments.reset(list(range(count)))
+        past: list[list[dict[str, Any]]] = [[] for _ in range(count)]
+        going, back = np.ones(count, bool), rng.integers(1, BACK + 1, count)
+        action = np.zeros((environments.num_envs, len(self.gait.actions)))
+        while going.any():
+            ids = np.flatnonzero(going)
+            for i in ids.tolist():
+                past[i] = [*past[i], environments.get_state([i])][-BACK:]
+            chosen = rng.integers(len(vectors), size=len(ids)) * (rng.random(len(ids)) < OTHERS)
+            action[ids] = self.bench.actions(vectors[chosen])
+            step = environments.step(action, ids)
+            ended = step.terminated | step.truncated
+            for i in ids[ended[ids]].tolist():
+                if len(past[i]) >= back[i]:
+                    going[i] = False
+                else:  # the episode is too short
+                    environments.reset([i])
+                    past[i] = []
+        return [states[-number] for states, number in zip(past, back, strict=True)]
+
+    def scores(self, vectors: np.ndarray, states: Sequence[dict[str, Any]]) -> np.ndarray:
+        """Returns the scores of gaits (m, P) in each state, (m, states)."""
+        environments, count = self.bench.environments, len(states)
+        most = environments.num_envs // count
+        found = []
+        for first in range(0, len(vectors), most):
+            part = vectors[first : first + most]
+            going = np.arange(len(part) * count)
+            for i in going.tolist():
+                environments.set_state(states[i % count], [i])
+            begin = tune_gait.position(environments)[going]
+            reached = begin.copy()
+            candidate, default = np.zeros((2, environments.num_envs, len(self.gait.actions)))
+            candidate[going] = np.repeat(self.bench.actions(part), count, axis=0)
+            default[:] = self.bench.actions(self.default)
+            for cycle in range(self.lead + AFTER):
+                step = environments.step(candidate if cycle < self.lead else default, going)
+                going = going[~(step.terminated | step.truncated)[going]]
+                reached[going] = tune_gait.position(environments)[going]
+                if not len(going):
+                    break
+            share = np.clip((reached - begin) / self.usual, 0, 1)
+            found.append(share.reshape(len(part), count))
+        return np.concatenate(found)
+
+    def alone(self, vectors: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        """Returns the scores of repeated gaits (m, P) for each start, (m, starts)."""
+        shape = len(vectors), len(seeds)
+        rows, n = self.bench.environments.num_envs, len(vectors) * len(seeds)
+        vectors, seeds = np.repeat(vectors, len(seeds), axis=0), np.tile(seeds, len(vectors))
+        found = []
+        for first in range(0, n, rows):  # the last part is filled up
+            part = np.arange(first, first + rows) % n
+            runs = self.bench.run(vectors[part], seeds[part], HORIZON, np.full(rows, FRICTION))
+            found.append(runs.distance / (HORIZON * self.gait.target_speed))
+        return np.clip(np.concatenate(found)[:n], 0, 1).reshape(shape)
+
+
+def search(
+    objective: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    gait: Parameters,
+    arguments: argparse.Namespace,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Returns the best gaits of the last generations, and the mean of the last one, (m, P)."""
+    import cma
+
+    def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
+        result = np.tile(start, (len(candidates), 1))
+        result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
+        result[:, gait.absolute] = np.abs(result[:, gait.absolute])
+        result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
+        if arguments.within:
+            # Rounding to `DIGITS` would leave the range.
+            result = gait.vector(gait.action(result).clip(-1, 1)).round(9)
+        return result
+
+    options = {
+        'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
+        'seed': int(rng.integers(1, 2**31)),
+    }  # fmt: skip
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(gait.actions)), arguments.sd, options)
+    finalists: list[np.ndarray] = []
+    for number in range(arguments.generations):
+        candidates = strategy.ask()
+        scores = objective(vectors(candidates))
+        strategy.tell(candidates, -scores)
+        finalists = [*finalists, candidates[scores.argmax()]][-FINALISTS:]
+        if number % 10 == 9:
+            print(f'  {number + 1:3} best {scores.max():.3f} mean {scores.mean():.3f}', flush=True)
+    return vectors([strategy.result.xfavorite, *finalists])
+
+
+def alone(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches for a gait to repeat; returns it (P,), and all scores from new starts (m, starts)."""
+    seeds = rng.integers(2**32, size=(2, 4 * STARTS))
+    start = known[obstacles.alone(known, seeds[0]).mean(1).argmax()]
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return obstacles.alone(vectors, rng.integers(2**32, size=STARTS)).mean(1)
+
+    found = search(objective, start, obstacles.gait, arguments, rng)
+    chosen = found[obstacles.alone(found, seeds[0]).mean(1).argmax()]
+    return chosen, obstacles.alone(np.array([*known, chosen]), seeds[1])
+
+
+def complement(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches for a gait to add; returns it (P,), and all scores in new states (m, states)."""
+    states = obstacles.collect(known, STATES, rng)
+    before = obstacles.scores(known, states)
+    best = before.max(0)
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return np.maximum(obstacles.scores(vectors, states), best).mean(1)
+
+    found = search(objective, known[before.mean(1).argmax()], obstacles.gait, arguments, rng)
+    fresh = [obstacles.collect(known, VALIDATION, rng) for _ in range(2)]
+    best = obstacles.scores(known, fresh[0]).max(0)
+    chosen = found[np.maximum(obstacles.scores(found, fresh[0]), best).mean(1).argmax()]
+    return chosen, obstacles.scores(np.array([*known, chosen]), fresh[1])
+
+
+def steadiness(
+    bench: tune_gait.Bench, vectors: np.ndarray, length: float, seeds: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Measures how much the places depend on the state that gaits (m, P) reach on flat ground.
+
+    Args:
+      bench: at least m * starts * COPIES simulations.
+      vectors: the gaits, (m, P).
+      length: smallest desired length of a cycle, m.
+      seeds: seeds of the starts, (starts,).
+
+    Returns:
+      The scores, (m,); and figures of each gait: `upright`, the share of simulations that have not
+      fallen, (m,); `spread`, the mean standard deviation of the copies' places after each cycle since
+      the change, (m, AHEAD) m; `length` of the cycles, (m,) m; and `speed`, (m,) m/s.
+    """
+    environments, shape = bench.environments, (len(vectors), len(seeds), COPIES)
+    going = np.arange(np.prod(shape))
+    action = np.zeros((environments.num_envs, len(bench.gait.actions)))
+    action[going] = np.repeat(bench.actions(vectors), len(seeds) * COPIES, 0)
+    environments.reset(seed=np.resize(np.repeat(seeds, COPIES), environments.num_envs).tolist())
+    places, duration = np.full((AHEAD + 1, len(going)), np.nan), np.zeros(len(going))
+    for cycle in range(SETTLED + AHEAD + 1):
+        if cycle >= SETTLED:
+            places[cycle - SETTLED, going] = tune_gait.position(environments)[going]
+        if cycle == SETTLED:
+            rng = np.random.default_rng(seeds)
+            joints = environments.task.world.qpos.shape[1] - 3
+            for i in going.tolist():
+                state = environments.get_state([i])
+                new = tune_gait.nudged(environments, state, rng.normal(0, CHANGE, joints))
+                environments.set_state(new, [i])
+        if cycle == SETTLED + AHEAD or not len(going):
+            break
+        step = environments.step(action, going)
+        if cycle >= SETTLED:
+            duration[going] += bench.task.state.duration[going]
+        going = going[~(step.terminated | step.truncated)[going]]
+    whole = np.isfinite(places[-1])
+    # If a copy has fallen, the spread of its start counts as 1 m.
+    spread = np.where(whole, places - places[0], 0.0)[1:].reshape(AHEAD, *shape).std(3)
+    spread[:, ~whole.reshape(shape).all(2)] = 1.0
+    distance = np.where(whole, places[-1] - places[0], 0.0).reshape(len(vectors), -1).sum(1)
+    count = np.maximum(whole.reshape(len(vectors), -1).sum(1), 1)
+    duration = np.where(whole, duration, 0.0).reshape(len(vectors), -1).sum(1)
+    figures = {
+        'upright': whole.reshape(len(vectors), -1).mean(1), 'spread': spread.mean(2).T,
+        'length': distance / count / AHEAD, 'speed': distance / np.maximum(duration, 1e-9),
+    }  # fmt: skip
+    away = np.abs(figures['speed'] - bench.gait.target_speed)
+    score = -np.log10(figures['spread'] + CLOSE).mean(1) - FALLS * (1 - figures['upright'])
+    score -= LENGTH * np.maximum(0, length - figures['length'])
+    return score - SPEED * np.maximum(0, away - SPEED_TOLERANCE), figures
+
+
+def steady(
+    gait: Parameters, start: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Searches for a steady gait; returns it (P,), and figures of it and of the start."""
+    rows = max(arguments.population, FINALISTS + 1) * 2 * STARTS * COPIES
+    bench = tune_gait.Bench(gait.character, rows, gait.action_offset)
+
+    def measured(vectors: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return steadiness(bench, vectors, arguments.steady, rng.integers(2**32, size=2 * STARTS))
+
+    found = search(lambda vectors: measured(vectors)[0], start, gait, arguments, rng)
+    chosen = found[measured(found)[0].argmax()]
+    score, figures = measured(np.array([start, chosen]))
+    bench.environments.close()
+    return chosen, {
+        name: {key: np.round(value[row], 3).tolist() for key, value in figures.items()}
+        | {'score': round(float(score[row]), 3)}
+        for row, name in enumerate(('start', 'found'))
+    }
+
+
+def score(obstacles: Obstacles, terrain: str, rng: np.random.Generator) -> pathlib.Path:
+    """Writes the scores of the base actions that are sets chosen by hand, in states before falls."""
+    gait = obstacles.gait
+    states = obstacles.collect(gait.base_actions, VALIDATION, rng)
+    scores = obstacles.scores(gait.base_actions, states)
+    data = tune_gait.stored(gait.character)
+    tuning = data.setdefault('tuning', {})
+    originals = {name for a, b, _ in data.get('original_base_actions', ()) for name in (a, b)}
+    for number, (name, _, blend) in enumerate(gait.blends):
+        if (
+            blend == 0
+            and name not in originals
+            and tuning.get(name, {}).get('search', HAND) == HAND
+        ):
+            tuning[name] = {
+                'terrain': terrain, 'search': HAND, 'default': round(float(scores[0].mean()), 3),
+                'set_before': round(float(np.delete(scores, number, 0).max(0).mean()), 3),
+                'alone': round(float(scores[number].mean()), 3),
+                'set_after': round(float(scores.max(0).mean()), 3),
+            }  # fmt: skip
+    return tune_gait.write(gait.character, data)
+
+
+def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
+    """Makes gaits the base actions of a character, in this order.
+
+    Numbers are indices of base actions of the original. The default gait, if it is the base action of
+    an index, is that index of the new ones.
+
+    Raises:
+      ValueError: a name is unknown, or there are too few.
+    """
+    data = tune_gait.stored(character)
+    default = data['action_offset']
+    if isinstance(default, int) and default >= len(names):
+        raise ValueError(f'{len(names)} gaits; the default gait is base action {default}')
+    data.setdefault('tuning', {})
+    original = data.setdefault('original_base_actions', data['base_actions'])
+    numbers = list(map(str, range(len(original))))
+    for name in names:
+        if name in found:
+            data['sets'][name] = found[name]['vector']
+            data['tuning'][name] = found[name]['tuning']
+        elif name not in data['sets'] and name not in numbers:
+            raise ValueError(errors.unknown('gait', name, [*found, *data['sets'], *numbers]))
+    data['base_actions'] = [
+        original[int(name)] if name in numbers else [name, name, 0] for name in names
+    ]
+    used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
+    used.add(default)
+    used |= {name for name, record in data['tuning'].items() if record.get('within')}
+    for part in ('sets', 'tuning'):
+        data[part] = {name: value for name, value in data[part].items() if name in used}
+    return tune_gait.write(character, data)
+
+
+def add(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
+    """Stores gaits that a search within the action range has found.
+
+    Raises:
+      ValueError: there is no such gait.
+    """
+    data = tune_gait.stored(character)
+    within = [name for name, record in found.items() if record['tuning'].get('within')]
+    for name in names:
+        if name not in within:
+            raise ValueError(errors.unknown('gait within the action range', name, within))
+        data['sets'][name] = found[name]['vector']
+        data.setdefault('tuning', {})[name] = found[name]['tuning']
+    return tune_gait.write(character, data)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('character', choices=controllers.available())
+    parser.add_argument('--within', action='store_true', help='search within the action range')
+    parser.add_argument('--alone', action='store_true', help='repeat the gait; with --terrain')
+    group = parser.add_mutually_exclusive_group(required=True)
+    group.add_argument('--terrain', nargs='+', help='terrains; one gait is searched for each')
+    group.add_argument(
+        '--steady', type=float, metavar='LENGTH', help='search for a gait with such cycles, m'
+    )
+    parser.add_argument(
+        '--start', nargs='+', help='sets, or numbers of base actions; default: the default gait'
+    )
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument(
+        '--sd', type=float, default=0.5, help='initial standard deviation, in search scales'
+    )
+    parser.add_argument('--population', type=int, default=12)
+    parser.add_argument('--generations', type=int, default=30)
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    group.add_argument(
+        '--enter',
+        nargs='+',
+        metavar='SET',
+        help='sets, or numbers of base actions of the original, that become the base actions',
+    )
+    group.add_argument(
+        '--add', nargs='+', metavar='SET', help='sets, found with --within, that are stored'
+    )
+    group.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
+    arguments = parser.parse_args()
+    if arguments.steady is not None and not 0 < arguments.steady < np.inf:
+        parser.error(f'argument --steady: {arguments.steady}; expected a length above 0 m')
+    gait = controllers.load(arguments.character)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    path = arguments.output / f'{gait.character}.json'
+    stored = json.loads(path.read_text()) if path.exists() else {}
+
+    if arguments.enter:
+        print(enter(gait.character, stored, arguments.enter))
+        return
+
+    if arguments.add:
+        print(add(gait.character, stored, arguments.add))
+        return
+
+    if arguments.score:
+        obstacles = Obstacles(gait, arguments.score, gait.action_offset, VALIDATION)
+        print(score(obstacles, arguments.score, np.random.default_rng(arguments.seed)))
+        return
+
+    def vector(name: str) -> np.ndarray:
+        if name in stored:
+            return np.array(stored[name]['vector'])
+        return tune_gait.vector_of(gait, name)
+
+    known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
+    rng = np.random.default_rng(arguments.seed)
+    settings = {'known': arguments.start or ['default gait']} | {
+        name: getattr(arguments, name)
+        for name in ('seed', 'generations', 'population', 'sd', 'within')
+    }
+
+    def add_found(kind: str, vector: np.ndarray, record: dict[str, Any]) -> None:
+        number = 1 + sum(name.rsplit('_', 1)[0] == kind for name in stored)
+        stored[f'{kind}_{number}'] = {'vector': vector.tolist(), 'tuning': record}
+        print(f'{kind}_{number}', record, flush=True)
+        files.write_json(stored, path)
+
+    if arguments.steady is not None:
+        began = time.process_time()
+        chosen, figures = steady(gait, known[0], arguments, rng)
+        record = {
+            'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
+            **settings, **figures,
+            'cpu_seconds': round(time.process_time() - began),
+        }  # fmt: skip
+        add_found(steady.__name__, chosen, record)
+    for terrain in arguments.terrain or ():
+        began = time.process_time()
+        print(gait.character, terrain, flush=True)
+        have = np.array(known)
+        num_envs = arguments.population * (STARTS if arguments.alone else STATES)
+        obstacles = Obstacles(gait, terrain, have[0], num_envs)
+        tune = alone if arguments.alone else complement
+        chosen, scores = tune(obstacles, have, arguments, rng)
+        obstacles.bench.environments.close()
+        record = {
+            'terrain': terrain, 'search': tune.__name__, **settings,
+            'default': round(float(scores[0].mean()), 3),
+            'set_before': round(float(scores[:-1].max(0).mean()), 3),
+            'alone': round(float(scores[-1].mean()), 3),
+            'set_after': round(float(scores.max(0).mean()), 3),
+            'cpu_seconds': round(time.process_time() - began),
+        }  # fmt: skip
+        known.append(chosen)
+        add_found(terrain, chosen, record)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()
