@@ -178,8 +178,8 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
 
 
 EXPERTS = {
-    'expert': 'an expert with a map (`examples/expert.py`)',
-    'joint_expert': 'planned footsteps and the controller that tracks them (`examples/joint_expert.py`)',
+    'expert': 'an expert with a map (`training/expert.py`)',
+    'joint_expert': 'planned footsteps and the controller that tracks them (`training/joint_expert.py`)',
 }
 
 
