@@ -281,7 +281,24 @@ class LibraryTest(parameterized.TestCase):
                 unittest.mock.patch.object(mujoco, '__file__', file),
                 self.assertRaisesRegex(ImportError, f'no MuJoCo library .* in {folder}; install'),
             ):
-                native.addresses.__wrapped__()
+                native.library.__wrapped__()
+
+    @parameterized.parameters('3.17.0', '3.16.0')
+    def test_bounds_are_those_of_set_const(self, version):
+        """Of geoms of static bodies that were moved, with all versions of MuJoCo."""
+        found, rng = [model(), model()], np.random.default_rng(0)
+        pose, size = rng.normal(size=7), rng.uniform(1, 2, 3)
+        for each in found:
+            floor = each.geom('floor')
+            floor.pos, floor.quat, floor.size = pose[:3], pose[3:] / np.linalg.norm(pose[3:]), size
+        with unittest.mock.patch.object(mujoco, '__version__', version):
+            native.set_bounds.__wrapped__()(found[0], mujoco.MjData(found[0]))
+        mujoco.mj_setConst(found[1], mujoco.MjData(found[1]))
+        for name in dir(found[0]):
+            values = [getattr(each, name) for each in found]
+            if not name.startswith('_') and isinstance(values[0], np.ndarray):
+                np.testing.assert_array_equal(*values, name)
+        self.assertNotEqual(found[0].geom_rbound[0], model().geom_rbound[0])
 
 
 class ShareTest(parameterized.TestCase):

@@ -151,7 +151,7 @@ class PlanarArena(composer.Arena):
         ground.vertical[:], self.ground.start[env_id] = vertical, start
         end = (start + BEHIND + AHEAD) * SPACING
         boxes.pose(pieces, surface[1], boxes.angles(pieces), end, self._pools[env_id])
-        self._world.set_const(env_id)
+        self._world.set_const(env_id, ground_only=True)
 
 
 @compiled

@@ -281,7 +281,7 @@ class SpatialArena(composer.Arena):
             cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
             east, north = belts.velocity.T
             run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
-        self._world.set_const(env_id)
+        self._world.set_const(env_id, ground_only=not len(self._bodies))
         if self._field >= 0:
             self._show(model)
 

@@ -153,15 +153,20 @@ class World:
         """Resets simulations to the model's initial state and clears their warnings."""
         native.reset_all(self.all_ids[env_ids], self.pack)
 
-    def set_const(self, env_id: int) -> None:
-        """Applies changes to the static geoms of a simulation.
+    def set_const(self, env_id: int, ground_only: bool = False) -> None:
+        """Recomputes what MuJoCo derives from a model, after the model was changed.
 
         Without this call, bodies fall through changed geoms.
+
+        Args:
+          env_id: index of the simulation.
+          ground_only: whether only poses and sizes of geoms of static bodies were changed.
         """
         scratch = getattr(self._local, 'scratch', None)
         if scratch is None:  # one per thread: mj_setConst overwrites the state of its MjData
             scratch = self._local.scratch = mujoco.MjData(self.models[0])
-        mujoco.mj_setConst(self.models[env_id], scratch)
+        update = native.set_bounds() if ground_only else mujoco.mj_setConst
+        update(self.models[env_id], scratch)
 
     def get_state(self, env_id: int) -> np.ndarray:
         """Returns the full integration state of one simulation."""
