@@ -2,7 +2,7 @@
 
 All of these change between physics steps, so that compiled code writes them into MuJoCo's data and
 model before each step; see `trl_suite.engine.native.step`. `trl_suite.actuation.realism` decides what
-they are. Without motors, an engine steps as if this module did not exist.
+they are.
 
 A motor's torque t, in the direction in which it acts, is at most
 
@@ -121,12 +121,10 @@ class Motors(NamedTuple):
     """Imperfect motors of n simulations.
 
     Attributes:
-      active: whether there are any.
       fields: addresses of qpos, qvel, ctrl, qfrc_applied, actuator_force in the data of each
         simulation and of actuator_forcerange in its model, (n, 6).
     """
 
-    active: bool
     fields: np.ndarray
     limits: Limits
     noise: Noise
@@ -186,13 +184,7 @@ def motors(
         for model, each in zip(models, data, strict=True)
     ]  # fmt: skip
     state = _state(len(models), units, slots, models[0].nu, len(noise.dof))
-    return Motors(True, np.array(fields, np.int64), limits, noise, state)
-
-
-def none(n: int) -> Motors:
-    """Returns no motors, for n simulations."""
-    state = _state(n, 0, 0, 0, 0)
-    return Motors(False, np.zeros((n, 0), np.int64), limits(), noise(), state)
+    return Motors(np.array(fields, np.int64), limits, noise, state)
 
 
 def _state(n: int, units: int, slots: int, controls: int, dofs: int) -> MotorState:

@@ -41,8 +41,8 @@ class Engine(NamedTuple):
       time: simulated time, (n,) s.
       steps: physics steps since the world was made, (n,).
       timestep: duration of a physics step, s.
-      pushes: forces that act while the simulations are advanced.
-      motors: imperfections of the motors; by default there are none.
+      pushes: forces that act while the simulations are advanced; None for none.
+      motors: imperfections of the motors; None for none.
     """
 
     functions: np.ndarray
@@ -56,8 +56,8 @@ class Engine(NamedTuple):
     time: np.ndarray
     steps: np.ndarray
     timestep: float
-    pushes: pushes.Pushes
-    motors: motors.Motors
+    pushes: pushes.Pushes | None = None
+    motors: motors.Motors | None = None
 
 
 @functools.cache
@@ -175,12 +175,8 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     """
     model, data = engine.models[i], engine.data[i]
     arrays_to_physics(i, engine)
-    pushed = pushes.advance(i, engine.time[i], nstep * engine.timestep, engine.pushes)
-    if pushed:
-        begin_push(i, engine.pushes)
-    if engine.motors.active:
-        step_motors(i, nstep, engine)
-    else:
+    pushed = begin_push(i, nstep, engine, engine.pushes)
+    if not step_motors(i, nstep, engine, engine.motors):
         call(engine.functions[STEP2], model, data)
         for _ in range(nstep - 1):
             call(engine.functions[STEP], model, data)
@@ -193,27 +189,44 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     physics_to_arrays(i, engine)
 
 
+# Numba leaves out what follows a return for an argument that is None, and so compiles neither pushes
+# nor motors for an engine without.
+
+
 @compiled
-def begin_push(i: int, given: pushes.Pushes) -> None:
-    """Adds the force in `scratch[i, 3:]` to the forces on the body."""
+def begin_push(i: int, nstep: int, engine: Engine, given: pushes.Pushes | None) -> bool:
+    """Adds the mean force of a push to the forces on the body; returns whether there is one."""
+    if given is None:
+        return False
+    if not pushes.advance(i, engine.time[i], nstep * engine.timestep, given):
+        return False
     force, place = given.forces[i] + _FORCE_STRIDE * given.body[0], given.places[i]
     memory.copy(place, force, 3)
     for k in range(3):
         given.scratch[i, 3 + k] += given.scratch[i, k]
     memory.copy(force, place + 3 * _NUMBER, 3)
+    return True
 
 
 @compiled
-def end_push(i: int, given: pushes.Pushes) -> None:
+def end_push(i: int, given: pushes.Pushes | None) -> None:
     """Restores the forces on the body, bit for bit."""
+    if given is None:
+        return
     force = given.forces[i] + _FORCE_STRIDE * given.body[0]
     memory.copy(force, given.places[i], 3)
 
 
 @compiled
-def step_motors(i: int, nstep: int, engine: Engine) -> None:
-    """Advances a simulation by physics steps, before each of which its motors are updated."""
-    model, data, own = engine.models[i], engine.data[i], engine.motors
+def step_motors(i: int, nstep: int, engine: Engine, own: motors.Motors | None) -> bool:
+    """Advances a simulation by physics steps, before each of which its motors are updated.
+
+    Returns:
+      Whether there are motors; otherwise, nothing was done.
+    """
+    if own is None:
+        return False
+    model, data = engine.models[i], engine.data[i]
     motors.give(i, own)
     for _ in range(nstep):
         motors.prepare(i, own)
@@ -225,6 +238,7 @@ def step_motors(i: int, nstep: int, engine: Engine) -> None:
         call(engine.functions[STEP2], model, data)
         call(engine.functions[STEP1], model, data)
     motors.restore(i, own)
+    return True
 
 
 @compiled

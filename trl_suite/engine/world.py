@@ -117,8 +117,6 @@ class World:
             time=np.zeros(self.n),
             steps=np.zeros(self.n, int),
             timestep=models[0].opt.timestep,
-            motors=motors.none(self.n),
-            pushes=pushes.no_pushes(np.array([address(each.xfrc_applied) for each in data])),
         )
         self.pack = packed(self.engine)
 
@@ -137,13 +135,25 @@ class World:
         self.pack = packed(self.engine)
         return made.state
 
+    def set_pushes(self) -> pushes.Pushes:
+        """Returns pushes, to be filled in, saved and restored; at first there is none.
+
+        It must be called before a task keeps `engine`.
+        """
+        made = pushes.no_pushes(np.array([address(each.xfrc_applied) for each in self._data]))
+        self.engine = self.engine._replace(pushes=made)
+        self.pack = packed(self.engine)
+        return made
+
     # Methods for tasks; env_ids are sorted indices of simulations, without repeats. Those that do not
     # exist raise an IndexError.
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
         """Advances some or all simulations by `nstep` physics steps; velocities are then current."""
-        env_ids = self.all_ids if env_ids is None else self.all_ids[env_ids]
-        native.step_all(env_ids, nstep, self.pack)
+        if env_ids is None or env_ids is self.all_ids:
+            native.step_all(self.all_ids, nstep, self.pack)
+        else:
+            native.step_all(self.all_ids[env_ids], nstep, self.pack)
 
     def forward(self, env_ids: np.ndarray) -> None:
         """Recomputes all quantities that depend on the state, after the state was written."""

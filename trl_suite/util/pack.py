@@ -63,7 +63,7 @@ class Pack:
         """Packs a named tuple.
 
         Args:
-          value: a named tuple whose fields are arrays, numbers, or such tuples.
+          value: a named tuple whose fields are arrays, numbers, such tuples, or None.
         """
         words: list[bytes] = []
         self.numba_type = _describe(value, type(value).__name__, words)
@@ -92,10 +92,12 @@ def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
             words.append(struct.pack('=d', float(entry)))
         elif isinstance(entry, tuple) and hasattr(entry, '_fields'):
             found = _describe(entry, f'{path}.{name}', words)
+        elif entry is None:
+            found = types.none
         else:
             raise TypeError(
-                f'{path}.{name} is {type(entry).__name__}; expected an array, a number, or a named '
-                'tuple of these'
+                f'{path}.{name} is {type(entry).__name__}; expected an array, a number, None, or a '
+                'named tuple of these'
             )
         fields.append(Field(name, found, word))
     return PackType(type(value).__name__, tuple(fields))
@@ -132,6 +134,8 @@ def _read(context: Any, builder: Any, type_: PackType, pack: Any, name: str) -> 
     place = builder.gep(pack, [ir.IntType(64)(_WORD * field.word)])
     if isinstance(field.type, PackType):
         return place
+    if field.type is types.none:
+        return context.get_dummy_value()
     return _load(builder, place, context.get_value_type(field.type))
 
 

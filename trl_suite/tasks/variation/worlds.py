@@ -229,6 +229,10 @@ class Worlds(Component):
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {'randomize': (str(self._config.changed), self._config)}
 
+    def prepare(self, world: World) -> None:
+        if self._push is not None:
+            self._pushes = world.set_pushes()
+
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         task: Any = self.task
         figure, spatial = task.figure, task.character.spec.spatial
@@ -242,7 +246,7 @@ class Worlds(Component):
             'world': {name: getattr(properties, name) for name in self._config.varied}
         }
         if self._push is not None:
-            pushes, push = world.engine.pushes, self._push
+            pushes, push = self._pushes, self._push
             pushes.ranges[FORCE] = push.speed if push.force is None else push.force
             pushes.ranges[DURATION], pushes.ranges[INTERVAL] = push.duration, push.interval
             pushes.ranges[DIRECTION], pushes.planar[0] = push.direction, not spatial
@@ -263,16 +267,15 @@ class Worlds(Component):
             )  # fmt: skip
             self.variation.apply(env_id)
             if self._push is not None:
-                state = world.engine.pushes.state
+                state = self._pushes.state
                 seeded(env_id, spawned(seed, PUSH), state.stream)
                 state.impulse[env_id] = 0.0
                 first_push(np.array([env_id]), world.pack)
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if self._push is not None:
-            engine = self.task.world.engine
-            engine.pushes.state.impulse[env_ids] = 0.0
-            self._steps[env_ids] = engine.steps[env_ids]
+            self._pushes.state.impulse[env_ids] = 0.0
+            self._steps[env_ids] = self.task.world.engine.steps[env_ids]
 
     def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
         if self._push is None or fresh:
@@ -290,8 +293,8 @@ class Worlds(Component):
         """Returns an arrow for a push."""
         if self._push is None:
             return []
-        world = self.task.world
-        pushes, time = world.engine.pushes, world.time[env_id]
+        world, pushes = self.task.world, self._pushes
+        time = world.time[env_id]
         if not pushes.state.begin[env_id] <= time < pushes.state.end[env_id]:
             return []
         x, y, _ = pushes.state.force[env_id]
