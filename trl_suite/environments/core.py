@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from typing import Any
@@ -59,11 +60,13 @@ class Core:
             raise RuntimeError(
                 'another thread is using the environment; make one environment for each thread'
             )
-        try:
-            return self.usable()
-        except RuntimeError:
-            self._lock.release()
-            raise
+        if self._closed or self._pid is not None:
+            try:
+                self.usable()
+            except RuntimeError:
+                self._lock.release()
+                raise
+        return self
 
     def __exit__(self, *error: object) -> None:
         self._lock.release()
@@ -108,9 +111,9 @@ class Core:
         Returns:
           Whether they reached a limit, also if they failed.
         """
-        self.steps[ids] += 1
-        at_limit = self.steps[ids] >= (np.inf if step_limit is None else step_limit)
-        if time_limit < np.inf:
+        steps = self.steps[ids] = self.steps[ids] + 1
+        at_limit = np.False_ if step_limit is None else steps >= step_limit
+        if time_limit < math.inf:
             at_limit = at_limit | (self.world.time[ids] >= time_limit - TIME_ERROR)
         self.ended[ids] = at_limit | self.task.seen.failed[ids]
         return at_limit

@@ -209,6 +209,9 @@ class Task(composer.Task):
 
     def advance(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         """Advances some simulations by one step, with components; see `step`."""
+        if not self.components:
+            self.step(action, env_ids)
+            return
         for component in self.components:
             component.before_physics(action, env_ids)
         if self.in_parts or not self.step_in_parts:
