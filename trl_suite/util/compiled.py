@@ -18,7 +18,8 @@ index raises an IndexError. It runs without the global interpreter lock.
 A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
 in every caller. Python passes tuples of arrays to loops over simulations as packs, see `packed`.
 
-Numba is imported and a function is compiled when it is first called. Its machine code is kept in the
+Numba is imported and a function is compiled when it is first called from Python, with all that it
+calls as one piece of code. Its machine code is kept in the
 folder trl_suite/kernels/HASH in `$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends
 on all sources of the package, since compiled functions contain constants and code of other modules.
 Folders are used only if they belong to the user and nobody else can write there, because loading
@@ -81,11 +82,6 @@ class Compiled:
         """The Numba dispatcher for compiled callers; the function itself if compiling is disabled."""
         return self._made.get(False) or self._make(False)
 
-    @property
-    def entry(self) -> Callable[..., Any]:
-        """The compiled function for Python callers."""
-        return self._made.get(True) or self._make(True)
-
     def _make(self, entry: bool) -> Callable[..., Any]:
         with self._lock:
             if entry not in self._made:
@@ -96,22 +92,22 @@ class Compiled:
         numba = _numba()
         if numba.config.DISABLE_JIT:
             return self.function
-        options = {'nogil': True, 'error_model': 'numpy', 'forceinline': self._inline}
-        if not entry:  # wrappers for calls from Python take half of the compile time
-            options['no_cpython_wrapper'] = options['no_cfunc_wrapper'] = True
+        from trl_suite.util import machine_code
+
+        options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+        options |= {'forceinline': self._inline, 'no_cfunc_wrapper': True}
+        if not entry:
+            options |= {'no_cpython_wrapper': True, 'pipeline_class': machine_code.PartCompiler}
         if self._native is not None:  # not cached, since it is short; its callers are cached
             return numba.njit(self._native(), _nrt=True, **options)
-        options['_nrt'] = False
-        dispatcher = numba.njit(self.function, **options)
+        dispatcher = numba.njit(self.function, _nrt=False, **options)
         code = self.function.__code__
-        if not code.co_freevars and os.path.isfile(code.co_filename):
-            from trl_suite.util.machine_code import Cache
-
-            Cache(self.function, cache_folder(), entry).attach(dispatcher)
+        if entry and not code.co_freevars and os.path.isfile(code.co_filename):
+            machine_code.Cache(self.function, cache_folder()).attach(dispatcher)
         return dispatcher
 
     def __call__(self, *args: Any) -> Any:
-        return self.entry(*args)
+        return (self._made.get(True) or self._make(True))(*args)
 
 
 def compiled(function: Callable[..., Any]) -> Compiled:

@@ -1,13 +1,15 @@
-"""The files of machine code: written by this user, complete, and unchanged since.
+"""Machine code of functions that Python calls, and its files: of this user, complete, unchanged.
+
+The functions that they call become parts of their code: these are optimised together, once, and have
+no machine code and no files of their own.
 
 A file holds the code of one function for one signature: the SHA-256 of what follows, and a pickle. Its
 name is a hash of all that the code depends on, apart from the sources of the package, on which the
 name of the folder depends. What is missing, damaged, or may be written by others is compiled again.
 
 Two processes that need the same code at the same time do not both compile it: one holds a lock, which
-the operating system releases when the process ends in any way, and the other waits. A function is compiled
-while its callers are, and calls are not recursive, so that processes cannot wait for each other in
-a circle. There are no locks on Windows, and none on file systems without them.
+the operating system releases when the process ends in any way, and the other waits. There are no
+locks on Windows, and none on file systems without them.
 
 Numba's own files have no checksum, and two processes that compile a function for two signatures
 can write two entries of its index for one file.
@@ -24,13 +26,15 @@ import pickle
 import stat
 import sys
 import time
+import types
 import warnings
 from collections.abc import Callable
 from typing import Any, BinaryIO, cast
 
 import numba
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
@@ -41,22 +45,42 @@ _TICK = 0.05  # s between two looks at a lock
 _FLAGS = sum(getattr(os, name, 0) for name in ('O_NOFOLLOW', 'O_NONBLOCK', 'O_BINARY'))
 
 
+class _Part(JITCodeLibrary):
+    """Code that becomes part of the code of callers: it is neither optimised nor executed alone."""
+
+    codegen = types.SimpleNamespace(set_env=lambda name, environment: None)
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        return 0
+
+
+class PartCompiler(Compiler):
+    """Compiles functions that only compiled functions call."""
+
+    def __init__(self, typing_context: Any, target_context: Any, library: Any, *rest: Any) -> None:
+        library = library or _Part(target_context.codegen(), 'part')
+        super().__init__(typing_context, target_context, library, *rest)
+
+
 class Cache(NullCache):
     """What a dispatcher of Numba asks for the code of a function before it compiles it."""
 
-    def __init__(
-        self, function: Callable[..., Any], folder: pathlib.Path | None, entry: bool
-    ) -> None:
+    def __init__(self, function: Callable[..., Any], folder: pathlib.Path | None) -> None:
         """Prepares the cache of a function without free variables, which is in a file.
 
         Args:
           function: the Python function.
           folder: where the files are; None if code is not kept.
-          entry: whether the code can be called from Python.
         """
         code, config = function.__code__, cast(Any, numba.config)
         self._folder = folder
-        compiler = numba.__version__, config.OPT, config.BOUNDSCHECK, sys.version, entry
+        compiler = numba.__version__, config.OPT, config.BOUNDSCHECK, sys.version
         place = code.co_filename, _digest(code.co_filename), function.__qualname__
         self._key = (*compiler, *place, [*code.co_positions()])
 
@@ -111,35 +135,28 @@ def _load(path: pathlib.Path | None, signature: Any, target_context: Any) -> Com
             return None
 
 
-# Functions that are compiled, or waited for: each is called by the one before it.
+# The file of the function that is compiled, or waited for, if there is one.
 _pending: list[pathlib.Path | None] = []
 
 
 def _loaded_or_compiled(compile_: Callable[[Any], Any], signature: Any) -> Any:
     """Calls the method `compile` of a dispatcher, and ends what it has begun."""
-    with global_compiler_lock:  # only one thread has pending functions
-        before = len(_pending)
+    with global_compiler_lock:  # only one thread compiles
         try:
             return compile_(signature)
         finally:
-            while len(_pending) > before:
-                _end()
+            if _pending:
+                path = _pending.pop()
+                if path is not None:
+                    _change_lock(path, 'LOCK_UN')
+                notices.compiling.end()
 
 
 def _begin(path: pathlib.Path | None) -> None:
     _pending.append(path)
-    if len(_pending) == 1:
-        notices.compiling.begin()
+    notices.compiling.begin()
     if path is not None:
         _wait(path)
-
-
-def _end() -> None:
-    path = _pending.pop()
-    if path is not None:
-        _change_lock(path, 'LOCK_UN')
-    if not _pending:
-        notices.compiling.end()
 
 
 def _wait(path: pathlib.Path) -> None:
