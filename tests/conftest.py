@@ -29,7 +29,7 @@ def pytest_configure():
 # the first file; the other one meanwhile runs what needs few of them, and then the largest meshes,
 # while its memory is small. Last come short files.
 FIRST = (
-    'environment', 'ball_joints', 'characters', 'muscles', 'terrain', 'motion', 'clips3d', 'package',
+    'environment', 'ball_joints', 'characters', 'muscles', 'terrain', 'motion', 'clips', 'package',
     'compiled', 'foreign', 'browser', 'cli', 'vector', 'faults', 'commands', 'suite', 'gait',
     'disturbances',
 )  # fmt: skip
