@@ -6,16 +6,12 @@ import io
 import itertools
 import json
 import os
-import pathlib
-import subprocess
-import sys
-import tempfile
-import unittest
 import zipfile
 from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import FolderTest
 
 import trl_suite
 from trl_suite import motion, policies, suite
@@ -44,13 +40,13 @@ def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes
     return policies.Policy(**{**fields, **changes})
 
 
-def make_convolving(seed=0, size=0.6, **changes):
+def make_convolving(seed=0, size=0.6, origin=9, **changes):
     """A policy with convolutions over 9 heights, relative to the first of 4 other inputs."""
     rng = np.random.default_rng(seed)
     shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
     line = policies.Convolution(
         line=9, strides=(2, 1), weights=[rng.normal(0, size, shape) for shape in shapes],
-        biases=[rng.normal(0, 0.3, shape[2]) for shape in shapes], origin=9,
+        biases=[rng.normal(0, 0.3, shape[2]) for shape in shapes], origin=origin,
     )  # fmt: skip
     sizes = (3 * 5 + 4, 6, 5, 2)
     weights = [rng.normal(0, 0.6, pair) for pair in itertools.pairwise(sizes)]
@@ -75,87 +71,30 @@ def make_seeing(seed=0, **changes):
 
 
 def plain(policy, observation):
-    """The same in plain Python, one number after the other."""
-    hidden = {
-        'tanh': lambda x: float(np.tanh(x)),
-        'relu': lambda x: x if x > 0 else 0.0,
-        'elu': lambda x: x if x > 0 else float(np.exp(x)) - 1,
-    }[policy.activation]
-    line = policy.convolution
+    """The documented formula for one observation, in double precision."""
+    hidden = {'tanh': np.tanh, 'relu': lambda x: np.maximum(x, 0),
+              'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0)))}[policy.activation]  # fmt: skip
+    x, line = np.array(observation, float), policy.convolution
     if line is not None and line.origin is not None:
-        relative = [float(o) - float(observation[line.origin]) for o in observation[: line.line]]
-        observation = [*relative, *observation[line.line :]]
-    x = [
-        min(max((float(o) - float(m)) / float(s), -policy.clip), policy.clip)
-        for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
-    ]
-    if line is not None and line.grid is not None:
-        rows, columns = line.grid
-        maps = [x[i : i + rows * columns] for i in range(0, line.line, rows * columns)]
-        samples = [
-            [[each[row * columns + column] for each in maps] for column in range(columns)]
-            for row in range(rows)
-        ]
+        x[: line.line] -= x[line.origin]
+    x = np.clip((x - policy.mean) / policy.std, -policy.clip, policy.clip)
+    if line is not None:
+        maps = np.moveaxis(x[: line.line].reshape(-1, *(line.grid or (1, line.line))), 0, -1)
         for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
-            height, width, channels, filters = weight.shape
-            samples = [
-                [
-                    [
-                        hidden(
-                            sum(
-                                samples[i + h][j + w][c] * float(weight[h, w, c, o])
-                                for h in range(height)
-                                for w in range(width)
-                                for c in range(channels)
-                            )
-                            + float(bias[o])
-                        )
-                        for o in range(filters)
-                    ]
-                    for j in range(0, len(samples[0]) - width + 1, stride)
-                ]
-                for i in range(0, len(samples) - height + 1, stride)
-            ]
-        x = [value for row in samples for place in row for value in place] + x[line.line :]
-    elif line is not None:
-        samples = [[value] for value in x[: line.line]]
-        for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
-            width, channels, filters = weight.shape
-            samples = [
-                [
-                    hidden(
-                        sum(
-                            samples[start + w][c] * float(weight[w, c, o])
-                            for w in range(width)
-                            for c in range(channels)
-                        )
-                        + float(bias[o])
-                    )
-                    for o in range(filters)
-                ]
-                for start in range(0, len(samples) - width + 1, stride)
-            ]
-        x = [value for row in samples for value in row] + x[line.line :]
+            weight = weight.reshape(-1, *weight.shape[-3:])
+            (h, w), (rows, columns) = weight.shape[:2], maps.shape[:2]
+            maps = hidden(np.array([
+                [np.tensordot(maps[i : i + h, j : j + w], weight, 3) + bias
+                 for j in range(0, columns - w + 1, stride)]
+                for i in range(0, rows - h + 1, stride)
+            ]))  # fmt: skip
+        x = np.concatenate([maps.ravel(), x[line.line :]])
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        x = [
-            sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])
-            for o in range(len(bias))
-        ]
+        x = x @ weight.astype(float) + bias
         if i < len(policy.weights) - 1:
-            if policy.layer_norm:
-                mean = sum(x) / len(x)
-                variance = sum((value - mean) ** 2 for value in x) / len(x)
-                x = [(value - mean) / (variance + 1e-5) ** 0.5 for value in x]
-            x = [hidden(value) for value in x]
-    return [min(max(value, -1.0), 1.0) for value in x]
-
-
-class FolderTest(parameterized.TestCase):
-    def setUp(self):
-        super().setUp()
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = pathlib.Path(folder.name)
+            x = (x - x.mean()) / np.sqrt(x.var() + 1e-5) if policy.layer_norm else x
+            x = hidden(x)
+    return np.clip(x, -1, 1)
 
 
 class ActTest(parameterized.TestCase):
@@ -170,14 +109,17 @@ class ActTest(parameterized.TestCase):
         self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all
         self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
 
-    @parameterized.product(activation=tuple(policies.ACTIVATIONS), layer_norm=(False, True))
-    def test_a_line_can_be_convolved(self, activation, layer_norm):
-        policy = make_convolving(activation=activation, layer_norm=layer_norm)
-        observations = np.random.default_rng(1).normal(0, 2, (50, 13))
+    @parameterized.parameters(
+        *((make_convolving, a, norm) for a in policies.ACTIVATIONS for norm in (False, True)),
+        (make_seeing, 'tanh', False), (make_seeing, 'relu', True),
+    )  # fmt: skip
+    def test_convolutions(self, made, activation, layer_norm):
+        policy = made(activation=activation, layer_norm=layer_norm)
+        observations = np.random.default_rng(1).normal(0, 1.5, (50, policy.observation_size))
         expected = [plain(policy, row) for row in observations]
-        np.testing.assert_allclose(policy(observations), expected, atol=2e-6)
+        np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
 
-    @parameterized.parameters(make, make_convolving)
+    @parameterized.parameters(make, make_convolving, make_seeing)
     def test_an_ensemble_has_the_mean_output(self, make_one):
         scales = {'mean': make_one().mean, 'std': make_one().std}  # those of the whole ensemble
         members = []
@@ -208,25 +150,9 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_array_equal(changed.with_preference(0.3)([0.0]), [0.0])
         np.testing.assert_array_equal(changed.with_preference(0.1)([0.0]), [0.5])
 
-    def test_networks_of_an_ensemble_have_the_same_shapes(self):
-        one, line = make(), make_convolving()
-        two = policies.ensemble([one, one])
-        for changes, message in (
-            ({'weights': [*two.weights[:2], one.weights[2]]}, r'weight_2: .*expected \(2, 5, 2\)'),
-            ({'biases': [one.biases[0], *two.biases[1:]]}, r'bias_0: .*expected \(2, 6\)'),
-            ({'weights': [w[:0] for w in two.weights]}, 'weight_0: .*at least one network'),
-        ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
-                dataclasses.replace(two, **changes)
-        with self.assertRaisesRegex(ValueError, r'line: convolutions of 1 .* those of 2'):
-            dataclasses.replace(policies.ensemble([line, line]), convolution=line.convolution)
-        with self.assertRaisesRegex(ValueError, 'weight_0: is too large'):
-            policies.ensemble(
-                [one, dataclasses.replace(one, weights=[1e38 * w for w in one.weights])]
-            )
-
     def test_only_networks_of_one_policy_are_an_ensemble(self):
         one, line = make(), make_convolving()
+        two = policies.ensemble([one, one])
         shifted = dataclasses.replace(line.convolution, origin=10)
         weights = [np.zeros((13, 6)), *line.weights[1:]]
         bare = dataclasses.replace(line, convolution=None, weights=weights)
@@ -241,41 +167,28 @@ class ActTest(parameterized.TestCase):
         self.assertLen(policies.ensemble(mirrored).networks, 2)
         self.assertIs(policies.ensemble([one]), one)
         for members, message in (
-            ([], 'at least one'),
-            ([one, make(clip=2)], 'different clip'),
-            ([one, dataclasses.replace(one, std=2 * one.std)], 'different std'),
-            ([one, make(hidden=(6, 4))], 'different shapes'),
-            ([one, make(hidden=(6,))], 'different shapes'),
-            ([one, policies.ensemble([one, one])], 'one network each'),
+            ([], 'members: .*at least one'),
+            ([one, make(clip=2)], 'members: .*different clip'),
+            ([one, dataclasses.replace(one, std=2 * one.std)], 'members: .*different std'),
+            ([one, make(hidden=(6, 4))], 'members: .*different shapes'),
+            ([one, make(hidden=(6,))], 'members: .*different shapes'),
+            ([one, two], 'members: .*one network each'),
             ([line, dataclasses.replace(line, convolution=shifted)], 'different convolutions'),
-            ([line, bare], 'different convolutions'),
-            ([bare, line], 'different convolutions'),
-            ([one, dataclasses.replace(one, mirror=mirror)], 'different mirrors'),
+            ([line, bare], 'members: .*different convolutions'),
+            ([bare, line], 'members: .*different convolutions'),
+            ([one, mirrored[0]], 'members: .*different mirrors'),
         ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, f'members: .*{message}'):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 policies.ensemble(members)
-
-    @parameterized.parameters('tanh', 'relu')
-    def test_convolutions_over_maps(self, activation):
-        policy = make_seeing(activation=activation)
-        self.assertEqual(policy.convolution.outputs, 6)
-        observations = np.random.default_rng(1).normal(0, 1, (9, 64))
-        expected = [plain(policy, observation) for observation in observations]
-        np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
-        both = policies.ensemble([policy, policy])
-        self.assertLen(both.convolution.members, 2)
-        np.testing.assert_allclose(both.networks[0][0].weights[0], policy.convolution.weights[0])
-
-    @parameterized.parameters(
-        ((7, 6), r'grid: \(7, 6\) does not divide 60 inputs'),
-        ((60,), r'grid: \(60,\) does not divide'),
-        ((0, 6), r'grid: \(0, 6\) does not divide'),
-        ((5, 12), r'filter_0: has shape \(2, 3, 2, 4\); expected \(2, 3, 1, 4\)'),
-        ((30, 1), r'filter_0: 4 of width 2 x 3 and stride 2 on 30 x 1 positions'),
-    )
-    def test_malformed_maps_are_rejected(self, grid, message):
-        with self.assertRaisesRegex(ValueError, message):
-            dataclasses.replace(make_seeing().convolution, grid=grid)
+        for changes, message in (
+            ({'weights': [*two.weights[:2], one.weights[2]]}, r'weight_2: .*expected \(2, 5, 2\)'),
+            ({'biases': [one.biases[0], *two.biases[1:]]}, r'bias_0: .*expected \(2, 6\)'),
+            ({'weights': [w[:0] for w in two.weights]}, 'weight_0: .*at least one network'),
+            ({'convolution': line.convolution}, r'line: convolutions of 1 .* those of 2'),
+        ):
+            both = policies.ensemble([line, line]) if 'convolution' in changes else two
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                dataclasses.replace(both, **changes)
 
     @parameterized.parameters((make_convolving, 13), (make_seeing, 64))
     def test_convolutions_do_not_depend_on_the_batch(self, made, inputs):
@@ -407,15 +320,17 @@ class ActTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'different largest_change'):
             policies.ensemble([one, dataclasses.replace(other, largest_change=0.2)])
 
-    def test_a_policy_can_use_some_columns_only(self):
-        policy = make(
-            hidden=(), columns=np.array([4, 1]), mean=np.zeros(2), std=np.ones(2), clip=9,
-            weights=[np.eye(2) / 10], biases=[np.zeros(2)],
-        )  # fmt: skip
-        np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
-
-    def test_a_policy_can_have_cartesian_inputs(self):
+    def test_columns_and_cartesian_inputs(self):
         """Near ones where they are, far ones as a direction; columns count with them."""
+        some = {
+            'mean': np.zeros(2),
+            'std': np.ones(2),
+            'clip': 9,
+            'hidden': (),
+            'biases': [np.zeros(2)],
+        }
+        policy = make(columns=np.array([4, 1]), weights=[np.eye(2) / 10], **some)
+        np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
         policy = make(
             hidden=(), places=np.array([[1, 2], [4, 3]]), columns=np.array([7, 8, 9, 10]),
             mean=np.zeros(4), std=np.ones(4), clip=9, log_std=np.zeros(4), actions=tuple('abcd'),
@@ -482,18 +397,39 @@ class ActTest(parameterized.TestCase):
             make(**changes)
 
     @parameterized.parameters(
-        ({'strides': ()}, 'strides: 0 layers with 2 weights and 2 biases'),
-        ({'strides': (2, 0)}, 'filter_1: 5 of width 2 and stride 0 on 4 positions'),
-        ({'line': 2}, 'filter_0: 4 of width 3 and stride 2 on 2 positions'),
-        ({'weights': [np.zeros((3, 1, 4)), np.zeros((2, 3, 5))]}, r'filter_1: has shape \(2, 3, 5'),
-        ({'weights': [np.zeros((3, 4)), np.zeros((2, 4, 5))]}, r'filter_0: has shape \(3, 4\)'),
-        ({'biases': [np.zeros(4), np.zeros(4)]}, r'filter_bias_1: has shape \(4,\); expected \(5,'),
-        ({'origin': 13}, 'origin: is 13; expected a number of 0 to 12'),
-        ({'line': 14}, 'line: has 14 of 13 inputs'),
-        ({'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
+        (make_convolving, {'strides': ()}, 'strides: 0 layers with 2 weights and 2 biases'),
+        (
+            make_convolving,
+            {'strides': (2, 0)},
+            'filter_1: 5 of width 2 and stride 0 on 4 positions',
+        ),
+        (make_convolving, {'line': 2}, 'filter_0: 4 of width 3 and stride 2 on 2 positions'),
+        (
+            make_convolving,
+            {'weights': [np.zeros((3, 1, 4)), np.zeros((2, 3, 5))]},
+            'filter_1: has sh',
+        ),
+        (
+            make_convolving,
+            {'weights': [np.zeros((3, 4)), np.zeros((2, 4, 5))]},
+            'filter_0: has shape',
+        ),
+        (
+            make_convolving,
+            {'biases': [np.zeros(4), np.zeros(4)]},
+            r'filter_bias_1: .* expected \(5,',
+        ),
+        (make_convolving, {'origin': 13}, 'origin: is 13; expected a number of 0 to 12'),
+        (make_convolving, {'line': 14}, 'line: has 14 of 13 inputs'),
+        (make_convolving, {'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
+        (make_seeing, {'grid': (7, 6)}, r'grid: \(7, 6\) does not divide 60 inputs'),
+        (make_seeing, {'grid': (60,)}, r'grid: \(60,\) does not divide'),
+        (make_seeing, {'grid': (0, 6)}, r'grid: \(0, 6\) does not divide'),
+        (make_seeing, {'grid': (5, 12)}, r'filter_0: has shape .*; expected \(2, 3, 1, 4\)'),
+        (make_seeing, {'grid': (30, 1)}, r'filter_0: 4 of width 2 x 3 and stride 2 on 30 x 1 pos'),
     )
-    def test_malformed_convolutions_are_rejected(self, changes, message):
-        policy = make_convolving()
+    def test_malformed_convolutions_are_rejected(self, made, changes, message):
+        policy = made()
         with self.assertRaisesRegex(ValueError, message):
             line = dataclasses.replace(policy.convolution, **changes)
             dataclasses.replace(policy, convolution=line)
@@ -516,126 +452,63 @@ class CheckTest(absltest.TestCase):
         policy = make(blocks=blocks, actions=names)
         policy.check(environment)
         policy.check(VectorEnvironment(GAPS, 2, 1))
-        # Blocks and the flat vector of the environment lead to the same action.
-        time_step = environment.reset()
-        flat = suite.make(GAPS, {'random': 0}, {'flat_observation': True}).reset()
-        np.testing.assert_array_equal(
-            policy(time_step.observation), policy(flat.observation['observations'])
-        )
-        np.testing.assert_array_equal(policy(time_step.observation), policy(flat.observation))
-
-        with self.assertRaisesRegex(ValueError, 'observes pose .*gives terrain 50, pose'):
-            make(blocks=blocks[1:], actions=names).check(environment)
-        with self.assertRaisesRegex(ValueError, 'observes pose .*gives terrain 50, pose'):
-            make(blocks=[*blocks[1:], blocks[0]], actions=names).check(environment)
-        with self.assertRaisesRegex(ValueError, 'observes terrain 49, .*gives terrain 50, '):
-            make(blocks=[('terrain', 49), *blocks[1:]], actions=names).check(environment)
-        with self.assertRaisesRegex(
-            ValueError, f'sets .* of {names[1]}, .*takes .* of {names[0]}, '
+        for fields, message in (
+            ({'blocks': blocks[1:]}, 'observes pose .*gives terrain 50, pose'),
+            ({'blocks': [*blocks[1:], blocks[0]]}, 'observes pose .*gives terrain 50, pose'),
+            (
+                {'blocks': [('terrain', 49), *blocks[1:]]},
+                'observes terrain 49, .*gives terrain 50, ',
+            ),
+            (
+                {'actions': [*names[1:], names[0]]},
+                f'sets .* of {names[1]}, .*takes .* of {names[0]}, ',
+            ),
+            ({'quantity': 'torque'}, 'sets the torque of .*takes the target angle of'),
         ):
-            make(blocks=blocks, actions=[*names[1:], names[0]]).check(environment)
-        with self.assertRaisesRegex(ValueError, 'sets the torque of .*takes the target angle of'):
-            make(blocks=blocks, actions=names, quantity='torque').check(environment)
+            with self.assertRaisesRegex(ValueError, message):
+                make(**{'blocks': blocks, 'actions': names, **fields}).check(environment)
+
+
+NEEDED = *files._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))
 
 
 class FileTest(FolderTest):
-    def test_round_trip_is_exact(self):
-        policy = make(clip=0.1)
-        path = self.folder / 'p.npz'
+    @parameterized.parameters(
+        lambda: make(clip=0.1),
+        lambda: make(
+            places=np.array([[3, 1]]), columns=np.array([0, 2, 8]), mean=np.zeros(3), std=np.ones(3),
+            weights=[np.ones((3, 6))], biases=[np.arange(6)], largest_change=0.3,
+            choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)),
+        ),
+        lambda: make_convolving(layer_norm=True), lambda: make_convolving(origin=None),
+        lambda: policies.ensemble([make_convolving(layer_norm=True)] * 3), make_seeing,
+        lambda: policies.ensemble([make_seeing()] * 2),
+    )  # fmt: skip
+    def test_round_trip_is_exact(self, made):
+        policy, path = made(), self.folder / 'p.npz'
+        with self.assertRaisesRegex(FileNotFoundError, 'p.npz'):
+            policies.load(path)
         policies.save(policy, path)
-        self.assertEqual([each.name for each in self.folder.iterdir()], ['p.npz'])
+        self.assert_only('p.npz')
+        observations = np.random.default_rng(1).normal(size=(9, policy.observation_size))
         for again in (policies.load(path), policies.load(str(path))):
-            for name in ('id', 'blocks', 'actions', 'quantity', 'clip', 'activation', 'info'):
-                self.assertEqual(getattr(again, name), getattr(policy, name))
-            for name in ('mean', 'std', 'log_std'):
-                np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
-            self.assertEqual(again.info, {'seed': 0, 'rates': [0.001, None]})
-            for name in ('weights', 'biases'):
-                arrays = getattr(again, name)
-                for array, expected in zip(arrays, getattr(policy, name), strict=True):
-                    self.assertEqual(array.dtype, np.float32)
-                    np.testing.assert_array_equal(array, expected)
-            observations = np.random.default_rng(1).normal(size=(9, 7))
+            for one, other in ((policy, again), (policy.convolution, again.convolution)):
+                for field in dataclasses.fields(one) if one is not None else ():
+                    if field.name not in ('convolution', 'mirror'):
+                        ours, theirs = (getattr(each, field.name) for each in (one, other))
+                        np.testing.assert_equal(theirs, ours, field.name)
+            self.assertEqual({array.dtype for array in again.weights}, {np.dtype(np.float32)})
             np.testing.assert_array_equal(again(observations), policy(observations))
         # The same policy is the same file.
         policies.save(policies.load(path), self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
 
-    def test_round_trip_of_optional_fields(self):
-        policy = make(
-            places=np.array([[3, 1]]), columns=np.array([0, 2, 8]), mean=np.zeros(3), std=np.ones(3),
-            weights=[np.ones((3, 6))], biases=[np.arange(6)],
-            choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)), largest_change=0.3,
-        )  # fmt: skip
-        policies.save(policy, self.folder / 'p.npz')
-        again = policies.load(self.folder / 'p.npz')
-        for name in files._OPTIONAL:
-            np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
-            self.assertRegex(files.__doc__, rf'\n    {name}\b')
-
-    @parameterized.parameters((9, 1), (None, 1), (9, 3))
-    def test_round_trip_of_convolutions(self, origin, networks):
-        policy = make_convolving(layer_norm=True)
-        if networks > 1:
-            policy = policies.ensemble([policy] * networks)
-        line = dataclasses.replace(policy.convolution, origin=origin)
-        policy = dataclasses.replace(policy, convolution=line)
-        path = self.folder / 'p.npz'
-        policies.save(policy, path)
-        again = policies.load(path)
-        self.assertEqual(again.convolution.origin, origin)
-        observations = np.random.default_rng(1).normal(size=(9, 13))
-        np.testing.assert_array_equal(again(observations), policy(observations))
-        policies.save(again, self.folder / 'q.npz')
-        self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
-        for name in (*files._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
-            self.assertRegex(files.__doc__, rf'\n    {name}\b')
-
-    def test_round_trip_of_maps(self):
-        for policy in (make_seeing(), policies.ensemble([make_seeing()] * 2)):
-            policies.save(policy, self.folder / 'p.npz')
-            again = policies.load(self.folder / 'p.npz')
-            self.assertEqual(again.convolution.grid, (5, 6))
-            observations = np.random.default_rng(1).normal(size=(9, 64))
-            np.testing.assert_array_equal(again(observations), policy(observations))
-        self.assertRegex(files.__doc__, r'\n    grid\b')
-        with np.load(self.folder / 'p.npz') as data:
-            np.savez(self.folder / 'p.npz', **{**data, 'grid': np.array([7, 6])})
-        with self.assertRaisesRegex(ValueError, 'p.npz: grid: .* does not divide'):
-            policies.load(self.folder / 'p.npz')
-
-    @parameterized.parameters(
-        ({'line': None}, "'line': is missing"),
-        ({'strides': np.array([2, 1, 1])}, "'filter_2': is missing"),
-        ({'strides': np.array([2])}, "'filter_1': is unknown"),
-        ({'filter_bias_1': None}, "'filter_bias_1': is missing"),
-        ({'filter_0': np.zeros((3, 4))}, "'filter_0': has type float64 and 2 axes"),
-        ({'line': 2}, 'filter_0: 4 of width 3'),
-        ({'origin': 0.5}, "'origin': has type float64"),
-        ({'origin': 40}, 'origin: is 40; expected'),
-        ({'layer_norm': 2}, "'layer_norm': is 2; expected 1"),
-    )
-    def test_malformed_convolutions_are_rejected(self, changes, message):
-        policies.save(make_convolving(layer_norm=True), self.folder / 'p.npz')
-        with np.load(self.folder / 'p.npz') as data:
-            fields = {**data, **changes}
-        np.savez(
-            self.folder / 'p.npz',
-            **{name: value for name, value in fields.items() if value is not None},
-        )
-        with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
-            policies.load(self.folder / 'p.npz')
-
-    def test_the_format_is_the_documented_one(self):
+    def test_the_format(self):
         policies.save(make(), self.folder / 'p.npz')
         with np.load(self.folder / 'p.npz', allow_pickle=False) as data:
             arrays = dict(data)
-        for name in files._FIELDS:
-            self.assertRegex(files.__doc__, rf'\n    (\w+, )?{name}\b')
-        self.assertCountEqual(
-            arrays,
-            {*files._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
-        )
+        layers = (f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))
+        self.assertCountEqual(arrays, {*files._FIELDS, *layers})
         self.assertEqual((str(arrays['format']), int(arrays['version'])), ('trl_suite policy', 1))
         self.assertEqual(json.loads(str(arrays['info'])), make().info)
         for name, array in arrays.items():
@@ -675,10 +548,6 @@ class FileTest(FolderTest):
         with self.assertRaisesRegex(FileNotFoundError, 'does not exist'):
             policies.save(make(), self.folder / 'none' / 'p.npz')
 
-    def test_a_missing_file(self):
-        with self.assertRaisesRegex(FileNotFoundError, 'p.npz'):
-            policies.load(self.folder / 'p.npz')
-
     def test_truncated_or_damaged_or_no_archive(self):
         path = self.folder / 'p.npz'
         policies.save(make(), path)
@@ -697,14 +566,6 @@ class FileTest(FolderTest):
         with self.assertRaisesRegex(ValueError, "p.npz: field 'weight_1'"):
             policies.load(path)
 
-    def test_every_field_is_needed(self):
-        for name in self.fields():
-            with (
-                self.subTest(name),
-                self.assertRaisesRegex(ValueError, f'p.npz: .*{name}.*missing'),
-            ):
-                self.load_with(**{name: None})
-
     @parameterized.parameters(
         ({'format': 'clip'}, "'format': is 'clip'; expected 'trl_suite policy'"),
         ({'version': 2}, "'version': is 2; expected 1"),
@@ -712,35 +573,33 @@ class FileTest(FolderTest):
         ({'id': np.zeros(2)}, "'id': has type float64 and 1 axes"),
         ({'actions': np.array(['hip', 'knee'], object)}, "'actions': Object arrays cannot"),
         ({'weight_0': np.array([[None]])}, "'weight_0': Object arrays cannot"),
-        ({'mean': np.full(7, np.nan)}, 'mean: (inf|nan) at .*; expected finite numbers'),
-        ({'std': -np.ones(7)}, 'std: expected positive'),
-        ({'clip': np.inf}, 'clip: (inf|nan) at .*; expected finite numbers'),
-        (
-            {'weight_1': np.full((6, 5), np.inf)},
-            'weight_1: (inf|nan) at .*; expected finite numbers',
-        ),
-        ({'bias_2': np.array([0, np.nan])}, 'bias_2: (inf|nan) at .*; expected finite numbers'),
-        ({'weight_1': np.zeros((5, 6))}, r'weight_1: has shape \(5, 6\); expected \(6, 6\)'),
-        ({'weight_0': np.zeros((8, 6))}, r'weight_0: has shape \(8, 6\); expected \(7, 6\)'),
-        ({'weight_2': np.zeros((5, 3))}, r'weight_2: has shape \(5, 3\); expected \(5, 2\)'),
-        ({'bias_0': np.zeros(5)}, r'bias_0: has shape \(5,\); expected \(6,\)'),
         ({'weight_0': np.zeros((2, 7, 6))}, r"'weight_1': has type float\d+ and 2 axes"),
         ({'weight_0': np.zeros(7)}, "'weight_0': has type float64 and 1 axes"),
         ({'weight_0': np.zeros((7, 6), int)}, "'weight_0': has type int64 and 2 axes"),
         ({'block_sizes': np.array([3, 5])}, r'mean: has shape \(7,\); expected \(8,\)'),
         ({'block_sizes': np.array([7])}, r'zip\(\) argument 2 is shorter'),
-        ({'activation': 'sin'}, "unknown activation 'sin'"),
         ({'layers': 2}, "'layers': is 2, but there are arrays of other layers"),
         ({'layers': 10**15}, "'weight_3': is missing"),
         ({'layers': -1}, "'layers': is 0, but there are arrays of other layers"),
         ({'other': 1}, "'other': is unknown"),
         ({'info': '{'}, "'info': Expecting"),
-        ({'info': '[]'}, 'info: expected a dict'),
-        ({'info': '{"a": NaN}'}, 'info: not representable as JSON'),
+        ({'line': None}, "'line': is missing", make_convolving),
+        ({'strides': np.array([2, 1, 1])}, "'filter_2': is missing", make_convolving),
+        ({'strides': np.array([2])}, "'filter_1': is unknown", make_convolving),
+        ({'filter_bias_1': None}, "'filter_bias_1': is missing", make_convolving),
+        (
+            {'filter_0': np.zeros((3, 4))},
+            "'filter_0': has type float64 and 2 axes",
+            make_convolving,
+        ),
+        ({'origin': 0.5}, "'origin': has type float64", make_convolving),
+        ({'layer_norm': 2}, "'layer_norm': is 2; expected 1", make_convolving),
+        ({'grid': np.array([7, 6])}, 'grid: .* does not divide', make_seeing),
+        *(({name: None}, f'{name}.*missing') for name in NEEDED),
     )
-    def test_invalid_arguments_are_rejected(self, changes, message):
+    def test_invalid_arguments_are_rejected(self, changes, message, made=make):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
-            self.load_with(**changes)
+            self.load_with(made(), **changes)
 
     @parameterized.parameters(
         ('relu', 1e30, False, r'weight_\d: is too large: sums may reach \S+e\+(6|9)\d'),
@@ -749,6 +608,8 @@ class FileTest(FolderTest):
         ('relu', 1e15, True, None),
     )  # fmt: skip
     def test_weights_so_large_that_actions_are_nan(self, activation, size, layer_norm, message):
+        with self.assertRaisesRegex(ValueError, 'filter_1: is too large'):
+            make_convolving(size=1e30, activation='relu')
         shapes = (7, 6), (6, 5), (5, 2)
         weights = [np.where(np.indices(shape).sum(0) % 2, size, -size) for shape in shapes]
         fields = {'weights': weights, 'activation': activation, 'layer_norm': layer_norm}
@@ -759,21 +620,13 @@ class FileTest(FolderTest):
         observations = np.random.default_rng(0).normal(0, 1e6, (50, 7))
         self.assertTrue(np.isfinite(make(**fields)(observations)).all())
 
-    def test_filters_so_large_that_actions_are_nan(self):
-        with self.assertRaisesRegex(ValueError, 'filter_1: is too large'):
-            make_convolving(size=1e30, activation='relu')
-
-    def fields(self):
-        policies.save(make(), self.folder / 'p.npz')
-        with np.load(self.folder / 'p.npz') as data:
-            return dict(data)
-
-    def load_with(self, **changes):
+    def load_with(self, policy, **changes):
         """Loads a file with some fields changed, or left out where None."""
-        fields = {
-            name: value for name, value in (self.fields() | changes).items() if value is not None
-        }
-        np.savez(self.folder / 'p.npz', **fields)
+        policies.save(policy, self.folder / 'p.npz')
+        with np.load(self.folder / 'p.npz') as data:
+            fields = {**data, **changes}
+        kept = {name: value for name, value in fields.items() if value is not None}
+        np.savez(self.folder / 'p.npz', **kept)
         return policies.load(self.folder / 'p.npz')
 
 
@@ -892,10 +745,6 @@ class ShippedTest(parameterized.TestCase):
         self.assertEqual(names - set(catalogue.BY_ID) - studies, set())
         self.assertTrue((folder / 'README.md').exists())
 
-    @unittest.skip('until all are trained')
-    def test_every_environment_has_one(self):
-        self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
-
     def test_every_planar_environment_that_tracks_a_clip_has_one(self):
         specs = [
             spec
@@ -921,18 +770,6 @@ class ShippedTest(parameterized.TestCase):
         clip = motion.load(catalogue.BY_ID[id_].clip)
         whole = clip.speed * found['step_limit'] / 30  # m; as the clip goes
         self.assertGreater(np.median(distances), 0.7 * whole)
-
-
-class ImportTest(absltest.TestCase):
-    def test_needs_no_engine(self):
-        code = (
-            'import sys; from trl_suite import policies; policies.available();'
-            'print([name for name in ("mujoco", "dm_control", "torch") if name in sys.modules])'
-        )
-        done = subprocess.run(
-            [sys.executable, '-c', code], capture_output=True, text=True, check=True
-        )
-        self.assertEqual(done.stdout, '[]\n')
 
 
 if __name__ == '__main__':
