@@ -1,6 +1,7 @@
 """Frames show the current state, files are complete or absent, errors name remedies."""
 
 import contextlib
+import functools
 import io
 import itertools
 import os
@@ -80,27 +81,8 @@ class FrameTest(parameterized.TestCase):
         middle = image[40:80, 30:100]
         self.assertGreater(np.mean(np.abs(middle - sky).sum(2) > 90), 0.05)
 
-    @parameterized.parameters(
-        ({'camera': 'sid'}, "unknown camera 'sid'; did you mean 'side'"),
-        ({'camera': 2}, r'camera is 2; expected -1 to 1'),
-        ({'camera': -2}, r'camera is -2'),
-        ({'camera': None}, 'camera is None; expected a string or a whole number'),
-        ({'height': 0}, 'height is 0; expected a whole number from 1 to 1080, in pixels'),
-        ({'width': 1921}, 'width is 1921; expected a whole number from 1 to 1920, in pixels'),
-        ({'ghost': 'no'}, "ghost is 'no'; expected True or False"),
-    )
-    def test_invalid_arguments_are_rejected(self, options, message):
-        with self.assertRaisesRegex(ValueError, message):
-            rendering.frame(make(), **{**SMALL, **options})
 
-    def test_no_ghost_without_a_clip(self):
-        environment = composer.Environment(composer.NullTask(composer.Arena()))
-        self.assertEqual(rendering.frame(environment, 48, 64, camera=-1).shape, (48, 64, 3))
-        with self.assertRaisesRegex(ValueError, 'the task NullTask has no reference clip'):
-            rendering.frame(environment, 48, 64, camera=-1, ghost=True)
-
-
-class CameraTest(absltest.TestCase):
+class CameraTest(parameterized.TestCase):
     """A camera that follows 3 m behind along y; a wall from y = -4 to -2, and a ball as character."""
 
     XML = """
@@ -119,22 +101,13 @@ class CameraTest(absltest.TestCase):
     def place(self, physics, at):
         return cameras.free_place(physics.model.ptr, physics.data.ptr, 1, np.array(at, float))
 
-    def test_place_in_a_wall_is_moved_in_front_of_it(self):
-        physics = self.physics()
-        np.testing.assert_allclose(
-            self.place(physics, [0, -3, 0]), [0, -2 + cameras.MARGIN, 0], atol=1e-3
-        )
-
-    def test_place_closely_behind_a_wall_is_moved_in_front_of_it(self):
-        physics = self.physics()
-        np.testing.assert_allclose(
-            self.place(physics, [0, -4.5, 0]), [0, -2 + cameras.MARGIN, 0], atol=1e-3
-        )
-
-    def test_place_in_the_open_or_far_behind_the_wall_is_kept(self):
-        physics = self.physics()
-        for at in ([0, -1, 0], [0, 3, 0], [0, -6, 0], [0, 0, 5]):
-            np.testing.assert_array_equal(self.place(physics, at), at)
+    @parameterized.parameters(
+        ((0, -3, 0), -2 + cameras.MARGIN), ((0, -4.5, 0), -2 + cameras.MARGIN),  # in, closely behind
+        *((at, at[1]) for at in ((0, -1, 0), (0, 3, 0), (0, -6, 0), (0, 0, 5))),  # open, far behind
+    )  # fmt: skip
+    def test_place_is_moved_in_front_of_a_wall(self, at, y):
+        found = self.place(self.physics(), at)
+        np.testing.assert_allclose(found, (at[0], y, at[2]), atol=1e-3)
 
     def test_place_is_not_closer_than_the_smallest_distance(self):
         physics = self.physics()
@@ -192,26 +165,13 @@ class GhostTest(parameterized.TestCase):
             np.testing.assert_allclose(position, character + beside, atol=1e-5)
             self.assertLess(colour[3], 1)
 
-    def test_ghost_advances_while_the_character_lags(self):
-        environment = make(start_phase=0.0)
-        plain = rendering.frame(environment, **SMALL)
-        ghost = rendering.frame(environment, ghost=True, **SMALL)
-        changed = np.any(plain != ghost, axis=2)
-        self.assertBetween(np.mean(changed), 0.005, 0.5)
-        # Where the sky was, it is yellower than before.
-        sky = changed & (plain[:, :, 2] > 200)
-        self.assertGreater(sky.sum(), 20)
-        self.assertLess(
-            ghost[sky][:, 2].astype(float).mean(), plain[sky][:, 2].astype(float).mean() - 10
-        )
-
-    def test_changes_neither_model_nor_simulation(self):
+    def test_changes_the_picture_and_neither_model_nor_simulation(self):
         seen, unseen = make(seed=4), make(seed=4)
+        plain, ghost = (rendering.frame(seen, ghost=ghost, **SMALL) for ghost in (False, True))
+        self.assertBetween(np.mean(np.any(plain != ghost, axis=2)), 0.005, 0.5)
         model = seen.physics.model.ptr
-        before = {
-            name: np.array(getattr(model, name))
-            for name in ('geom_pos', 'geom_size', 'geom_rgba', 'qpos0', 'body_mass')
-        }
+        names = 'geom_pos', 'geom_size', 'geom_rgba', 'qpos0', 'body_mass'
+        before = {name: np.array(getattr(model, name)) for name in names}
         for i in range(20):
             action = np.full(11, 0.2 * np.sin(i))
             a, b = seen.step(action), unseen.step(action)
@@ -310,11 +270,12 @@ class VideoTest(FolderTest):
         self.assertIsNotNone(started[0].poll())  # it has ended, and cannot create the file later
         self.assert_only()
 
-    def test_gif(self):
+    @parameterized.parameters((32, 48), (33, 47))
+    def test_gif(self, *size):
         path = self.folder / 'a.gif'
-        rendering.video(numbered(5), str(path), fps=20)
+        rendering.video(numbered(5, *size), str(path), fps=20)
         frames = iio.imread(path)
-        self.assertEqual(frames.shape, (5, 32, 48, 3))
+        self.assertEqual(frames.shape, (5, *size, 3))
         np.testing.assert_allclose(frames.mean((1, 2, 3)), 10 * np.arange(5), atol=4)
         self.assertEqual(iio.immeta(path)['duration'], 50)
         self.assert_only('a.gif')
@@ -338,28 +299,10 @@ class VideoTest(FolderTest):
         for before, after in itertools.pairwise(images):
             self.assertTrue((before != after).any())
 
-    @parameterized.parameters(
-        ('a.avi', numbered(2), ValueError, "unknown suffix '.avi'; expected .mp4 or .gif"),
-        ('a.mp4', [], ValueError, 'no frames were given'),
-        ('a.mp4', numbered(2, height=33), ValueError, 'frames are 48x33 pixels; h264 needs even'),
-        ('a.gif', [*numbered(1), *numbered(1, 16)], ValueError, r'shape \(16, 48, 3\)'),
-        ('a.gif', [np.zeros((8, 8, 3))], ValueError, 'float64; expected'),
-        ('a.gif', [np.zeros((8, 8), np.uint8)], ValueError, r'shape \(8, 8\)'),
-        ('no/a.mp4', numbered(2), FileNotFoundError, 'the folder .* does not exist'),
-    )
-    def test_errors_leave_no_files(self, name, frames, error, message):
-        with self.assertRaisesRegex(error, message):
-            rendering.video(frames, self.folder / name)
-        self.assert_only()
-
     @parameterized.parameters('12:30.mp4', '-a%d.MP4', 'http:a.GIF')
     def test_names_with_a_meaning_for_ffmpeg_or_in_capitals(self, name):
         rendering.video(numbered(2), self.folder / name)
         self.assert_only(name)
-
-    def test_invalid_rates_are_rejected(self):
-        with self.assertRaisesRegex(ValueError, 'fps is 0'):
-            rendering.video(numbered(2), self.folder / 'a.mp4', fps=0)
 
     @parameterized.parameters('a.mp4', 'a.gif')
     def test_an_error_keeps_the_old_file(self, name):
@@ -372,38 +315,6 @@ class VideoTest(FolderTest):
 
         with self.assertRaises(KeyboardInterrupt):
             rendering.video(frames(), path)
-        self.assertEqual(path.read_text(), 'old')
-        self.assert_only(name)
-
-    @parameterized.parameters('a.mp4', 'a.gif', 'a.png', 'a.npz')
-    def test_a_full_disk(self, name):
-        path = self.folder / name
-        path.write_text('old')
-        program = """
-import resource, signal, sys
-import numpy as np
-from trl_suite import motion, rendering
-path, kind = sys.argv[1], sys.argv[1][-3:]
-images = list(np.random.default_rng(0).integers(0, 255, (40, 240, 320, 3), dtype=np.uint8))
-clip = motion.load('biped2d_walk')
-resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))  # bytes
-try:
-    if kind == 'png':
-        rendering.film_strip(images, path)
-    elif kind == 'npz':
-        clip.save(path)
-    else:
-        rendering.video(images, path)
-except OSError as error:
-    print(error)
-"""
-        done = subprocess.run(
-            [sys.executable, '-W', 'ignore', '-c', program, str(path)], capture_output=True, text=True,
-            timeout=60, check=False,
-        )  # fmt: skip
-        self.assertEqual((done.returncode, done.stderr), (0, ''))
-        self.assertIn(str(path), done.stdout)
-        self.assertLen(done.stdout.splitlines(), 1)
         self.assertEqual(path.read_text(), 'old')
         self.assert_only(name)
 
@@ -441,10 +352,6 @@ except OSError as error:
         ):
             rendering.video(numbered(2), self.folder / 'a.gif')
 
-    def test_odd_sizes_are_fine_in_a_gif(self):
-        rendering.video(numbered(2, 33, 47), self.folder / 'a.gif')
-        self.assertEqual(iio.imread(self.folder / 'a.gif').shape, (2, 33, 47, 3))
-
 
 class FilmStripTest(FolderTest):
     @parameterized.parameters((11, 6), (10, 4), (3, 8), (5, 1), (1, 8))
@@ -462,17 +369,6 @@ class FilmStripTest(FolderTest):
             self.assertLessEqual(gaps.max() - gaps.min(), 1)
         np.testing.assert_array_equal(iio.imread(path), strip)
         self.assert_only('strip.png')
-
-    def test_invalid_arguments_are_rejected(self):
-        for frames, options, message in (
-            ([], {}, 'at least one frame'),
-            (numbered(2), {'columns': 0}, 'columns is 0'),
-            ([*numbered(1), *numbered(1, 16)], {}, 'the same size'),
-            (numbered(2), {'path': self.folder / 'a.jpg'}, "suffix '.jpg'; expected .png"),
-        ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
-                rendering.film_strip(frames, **options)
-        self.assert_only()
 
 
 class SpatialTest(FolderTest):
@@ -511,32 +407,12 @@ class SpatialTest(FolderTest):
         half = rendering.height_map(environment, reach=4.0)[60, 20].astype(int)
         np.testing.assert_allclose(half, (level[0, 0].astype(int) + image[60, 20]) / 2, atol=1)
 
-    def test_height_map_of_stairs(self):
-        image = rendering.height_map(self.build('stairs3d')).astype(int)
-        brown = image[..., 0] - image[..., 2]
-        self.assertGreater(brown[:40].mean(), brown[180:220].mean() + 20)  # they go up ahead
-        path = self.folder / 'a.png'
-        again = rendering.height_map(self.build('stairs3d'), path)
-        np.testing.assert_array_equal(again, image)
-        np.testing.assert_array_equal(iio.imread(path), image)
-
     def test_height_map_of_a_planning_task(self):
-        environment = suite.make('PD_Biped3D_HLC_Forest-v0', {'random': 1})
-        environment.reset()
-        image = rendering.height_map(environment, reach=1.0).astype(int)
-        brown = (image[..., 0] - image[..., 2] > 100).mean()
+        environment, path = make('PD_Biped3D_HLC_Forest-v0'), self.folder / 'a.png'
+        image = rendering.height_map(environment, path, reach=1.0)
+        np.testing.assert_array_equal(iio.imread(path), image)
+        brown = (image[..., 0].astype(int) - image[..., 2] > 100).mean()
         self.assertBetween(brown, 0.001, 0.3)  # some pillars on level ground
-
-    def test_invalid_height_maps_are_rejected(self):
-        for make, options, message in (
-            (lambda: suite.make(GAPS), {}, 'the task PlanarImitation.*no map'),
-            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, "terrain_observation='height'"),
-            (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
-            (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
-        ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
-                rendering.height_map(make(), **options)
-        self.assert_only()
 
     def test_moving_boxes_have_no_ghosts(self):
         environment = suite.build(
@@ -559,46 +435,87 @@ class SpatialTest(FolderTest):
         shown = {round(alpha, 6) for mover, alpha in colours if not mover}
         self.assertEqual(shown, {overlays.GHOST_COLOUR[3]})
 
-    def test_maps_of_terrain(self):
-        for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
-            rendering.plot_terrain(
-                'steps3d', self.folder / f'{name}.png', **{'length': 10, 'draws': 2, **options}
-            )
-        a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
-        np.testing.assert_array_equal(a, b)
-        self.assertFalse(np.array_equal(a, c))
-        self.assertGreater(a.shape[1], d.shape[1])
-        for preset in ('plane', 'conveyor3d'):  # level ground
-            rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
-        with self.assertRaisesRegex(
-            ValueError, 'length is 301; expected a number above 0 and at most 300, in m'
-        ):
-            rendering.plot_terrain('plane', self.folder / 'f.png', length=301)
-        self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
+        @parameterized.parameters(
+            ('steps3d', 10, 1), ('gaps', 20, 0)
+        )  # side by side, below each other
+        def test_pictures_of_terrain_depend_on_the_seed(self, terrain, length, axis):
+            for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
+                path, options = self.folder / f'{name}.png', {'draws': 2, **options}
+                rendering.plot_terrain(terrain, path, length=length, **options)
+            a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
+            np.testing.assert_array_equal(a, b)
+            self.assertFalse(np.array_equal(a, c))
+            self.assertGreater(a.shape[axis], d.shape[axis])
+            for preset in ('plane', 'conveyor3d'):  # level ground
+                rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
+            self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
 
 
-class PlotTerrainTest(FolderTest):
-    def test_is_a_picture_that_depends_on_the_seed(self):
-        for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 5})):
-            rendering.plot_terrain('gaps', self.folder / f'{name}.png', length=20, **options)
-        a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
-        np.testing.assert_array_equal(a, b)
-        self.assertFalse(np.array_equal(a, c))
-        self.assertGreater(d.shape[0], a.shape[0])
-        self.assert_only('a.png', 'b.png', 'c.png', 'd.png')
+@functools.cache
+def task_of_its_own():
+    return composer.Environment(composer.NullTask(composer.Arena()))
 
-    def test_invalid_arguments_are_rejected(self):
-        for terrain, options, message in (
-            ('gasp', {}, "unknown terrain 'gasp'; did you mean 'gaps'"),
-            ('gaps', {'draws': 0}, 'draws is 0'),
-            ('gaps', {'length': float('nan')}, 'length is nan'),
-            ('gaps', {'length': -3.0}, 'length is -3.0'),
-            ('gaps', {'seed': -1}, 'seed is -1'),
-            ('gaps', {'terrain_level': float('nan')}, 'terrain_level is .*; expected a number'),
-        ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
-                rendering.plot_terrain(terrain, self.folder / 'a.png', **options)
+
+def frame(message, **options):
+    return lambda _: rendering.frame(make(), **{**SMALL, **options}), message
+
+
+def video(message, name, frames, **options):
+    return lambda folder: rendering.video(frames, folder / name, **options), message
+
+
+def strip(message, frames, name='a.png', **options):
+    return lambda folder: rendering.film_strip(frames, folder / name, **options), message
+
+
+def plot(message, terrain='gaps', **options):
+    return lambda folder: rendering.plot_terrain(terrain, folder / 'a.png', **options), message
+
+
+def heights(message, id_='PD_Biped3D_HLC_Forest-v0', name='a.png', **options):
+    return lambda folder: rendering.height_map(make(id_), folder / name, **options), message
+
+
+class ErrorsTest(FolderTest):
+    @parameterized.parameters(
+        frame("unknown camera 'sid'; did you mean 'side'", camera='sid'),
+        frame(r'camera is 2; expected -1 to 1', camera=2),
+        frame(r'camera is -2', camera=-2),
+        frame('camera is None; expected a string or a whole number', camera=None),
+        frame('height is 0; expected a whole number from 1 to 1080, in pixels', height=0),
+        frame('width is 1921; expected a whole number from 1 to 1920, in pixels', width=1921),
+        frame("ghost is 'no'; expected True or False", ghost='no'),
+        (lambda _: rendering.frame(task_of_its_own(), 48, 64, camera=-1, ghost=True),
+         'the task NullTask has no reference clip'),
+        video("unknown suffix '.avi'; expected .mp4 or .gif", 'a.avi', numbered(2)),
+        video('no frames were given', 'a.mp4', []),
+        video('frames are 48x33 pixels; h264 needs even', 'a.mp4', numbered(2, height=33)),
+        video(r'shape \(16, 48, 3\)', 'a.gif', [*numbered(1), *numbered(1, 16)]),
+        video('float64; expected', 'a.gif', [np.zeros((8, 8, 3))]),
+        video(r'shape \(8, 8\)', 'a.gif', [np.zeros((8, 8), np.uint8)]),
+        video('fps is 0', 'a.mp4', numbered(2), fps=0),
+        video('the folder .* does not exist', 'no/a.mp4', numbered(2)),
+        strip('at least one frame', []),
+        strip('columns is 0', numbered(2), columns=0),
+        strip('the same size', [*numbered(1), *numbered(1, 16)]),
+        strip("suffix '.jpg'; expected .png", numbered(2), 'a.jpg'),
+        plot("unknown terrain 'gasp'; did you mean 'gaps'", 'gasp'),
+        plot('draws is 0', draws=0),
+        plot('length is nan', length=float('nan')),
+        plot('length is -3.0', length=-3.0),
+        plot('length is 301; expected a number above 0 and at most 300, in m', 'plane', length=301),
+        plot('seed is -1', seed=-1),
+        plot('terrain_level is .*; expected a number', terrain_level=float('nan')),
+        heights('the task PlanarImitation.*no map', GAPS),
+        heights("terrain_observation='height'", 'PD_Biped3D_Imitate-v0'),
+        heights('reach is 0', reach=0),
+        heights("suffix '.gif'", name='a.gif'),
+    )  # fmt: skip
+    def test_errors_leave_no_files(self, call, message):
+        with self.assertRaisesRegex((ValueError, FileNotFoundError), message):
+            call(self.folder)
         self.assert_only()
+        self.assertEqual(rendering.frame(task_of_its_own(), 48, 64, camera=-1).shape, (48, 64, 3))
 
 
 DM_CONTROL_FIRST = 'from dm_control import composer'  # it chooses GLFW
@@ -735,13 +652,17 @@ class ThreadTest(parameterized.TestCase):
             if child == 0:
                 signal.alarm(50)
                 one.reset()
-                try:
-                    direct()
-                except RuntimeError as error:
-                    assert 'cannot render after a fork' in str(error), error
-                    one = None
-                    gc.collect()
-                    raise SystemExit
+                for each in one, make():
+                    try:
+                        each.physics.render(48, 64)
+                    except RuntimeError as error:
+                        assert 'cannot render after a fork' in str(error), error
+                    else:
+                        raise AssertionError('it renders')
+                one.close()
+                one = each = None
+                gc.collect()
+                raise SystemExit
             print(os.waitpid(child, 0)[1] == 0 and same(picture()))
             """,
         ),
@@ -792,38 +713,6 @@ except RuntimeError as error:
                 self.assertRegex(done.stdout, f'^cannot render.*MUJOCO_GL is {setting!r}')
                 self.assertRegex(done.stdout, 'egl or osmesa .* glfw .*\n$')
                 self.assertEqual(done.stdout.count('\n'), 1)
-
-    def test_a_forked_child_is_refused_not_hung(self):
-        if not hasattr(os, 'fork'):
-            self.skipTest('no fork here')
-        program = f"""
-import os, signal
-from trl_suite import rendering, suite
-from trl_suite.vector import VectorEnvironment
-environment, many = suite.make({GAPS!r}), VectorEnvironment({GAPS!r}, 1, 1)
-environment.reset()
-many.reset()
-rendering.frame(environment)
-child = os.fork()
-if child == 0:
-    signal.alarm(50)
-    new = suite.make({GAPS!r})
-    new.reset()
-    for each in environment, new:
-        try:
-            rendering.frame(each)
-        except RuntimeError as error:
-            print(error)
-    environment.close()
-    print('closed', flush=True)
-    os._exit(0)
-print(os.waitpid(child, 0)[1], rendering.frame(environment).std() > 10)
-"""
-        done = run_headless(program, {})
-        self.assertEqual((done.returncode, done.stderr), (0, ''))
-        lines = done.stdout.splitlines()
-        self.assertRegex(lines[0], "cannot render after a fork: .* 'spawn'$")
-        self.assertEqual(lines[1:], [lines[0], 'closed', '0 True'])
 
     @parameterized.parameters(
         (DM_CONTROL_FIRST, {}, 'True'),
