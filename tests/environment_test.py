@@ -2,7 +2,6 @@
 
 import contextlib
 import gc
-import importlib.util
 import io
 import json
 import pathlib
@@ -13,6 +12,7 @@ import weakref
 from unittest import mock
 
 import dm_env
+import golden
 import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
@@ -82,19 +82,10 @@ def is_high(id_):
     return suite.find(id_).task_type in ('goal_navigation', 'soccer')
 
 
-def golden():
-    """The program that stored the golden record."""
-    spec = importlib.util.spec_from_file_location('golden', ROOT / 'benchmarks/golden.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 # Numbers of the first steps, for seeds with which they do not depend on the last bits of anything,
 # so that they hold on other processors.
 ROOT = pathlib.Path(__file__).parents[1]
 STORED = json.loads((ROOT / 'tests/golden.json').read_text())
-GOLDEN = golden()
 
 # Steps of 1/30 s.
 ONE_BY_ONE = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
@@ -310,10 +301,10 @@ def every_environment(id_):
         def test_first_steps_equal_the_stored_ones(self):
             stored = dict(STORED[id_])
             made = None if high else self.made(0)  # planners of the record have another controller
-            found = GOLDEN.summary(id_, stored.pop('seed'), environment=made)
+            found = golden.summary(id_, stored.pop('seed'), environment=made)
             self.assertCountEqual(found, stored)
             for name, expected in stored.items():
-                tolerance = GOLDEN.TOLERANCE
+                tolerance = golden.TOLERANCE
                 np.testing.assert_allclose(
                     found[name][: len(expected)], expected, tolerance, tolerance, err_msg=name
                 )
@@ -423,7 +414,7 @@ class GoldenTest(absltest.TestCase):
             stored = {**STORED[id_], 'reward': [reward, *STORED[id_]['reward'][1:]]}
             path.write_text(json.dumps({id_: stored}))
             with contextlib.redirect_stdout(io.StringIO()) as printed:
-                self.assertEqual(GOLDEN.check(path, ''), not differs)
+                self.assertEqual(golden.check(path, ''), not differs)
             self.assertIn(f'MuJoCo lacks: nothing\n{differs}', printed.getvalue())
 
 

@@ -1,9 +1,9 @@
 """Records the outputs of environments, and compares records with current outputs bit by bit.
 
-    python benchmarks/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
-    python benchmarks/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
-    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  expected by the test
-    python benchmarks/golden.py check tests/golden.json [--filter PATTERN]  compares without the
+    python tests/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
+    python tests/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
+    python tests/golden.py store tests/golden.json [--filter PATTERN]  expected by the test
+    python tests/golden.py check tests/golden.json [--filter PATTERN]  compares without the
                         test, and with an engine that dm_control does not support yet
 
 Only the public interface is used, so that one version of the suite can record and another compare;
