@@ -42,14 +42,6 @@ class MovingTest(FolderTest):
             np.testing.assert_allclose(found, root, atol=1e-12)
         np.testing.assert_allclose(np.diff(times), moving.FRAME, atol=1e-3)
 
-    def test_the_camera_follows_evenly(self):
-        x = np.arange(60.0)
-        path = np.stack([x, 0 * x, 0.1 * (-1.0) ** x], axis=1)
-        smooth = moving._smooth(path)
-        self.assertEqual(smooth.shape, path.shape)
-        np.testing.assert_allclose(np.diff(smooth[10:-10, 0]), 1, atol=1e-2)
-        self.assertLess(np.abs(smooth[10:-10, 2]).max(), 0.05)  # of 0.1
-
     def test_no_obstacle_hides_the_character(self):
         environment, shot = shot_of(FOREST, 1.0)
         environment.set_state(shot.states[0])
@@ -101,10 +93,6 @@ class MovingTest(FolderTest):
             self.assertEqual(asked[0], (first, begin))
             self.assertEqual(asked[-1], (4, begin))
             self.assertLen(shot.states, 9)
-
-    def test_every_environment_has_one(self):
-        paths = [item.path for item in gallery.moving_items()]
-        self.assertEqual(paths, [f'moving/{id_}.webp' for id_ in suite.ALL_IDS])
 
     def test_refusals(self):
         with self.assertRaisesRegex(ValueError, 'an animated picture needs at least one picture'):

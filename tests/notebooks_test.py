@@ -23,7 +23,6 @@ NAMES = (
     'continual_learning',
 )  # fmt: skip
 LARGEST = 600e3  # bytes
-COLUMNS = 100
 EXTRAS = {
     'trl_suite.adapters.stable_baselines': 'stable_baselines3'
 }  # module -> what it needs beside us
@@ -78,31 +77,19 @@ class StoredTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_notebooks_have_the_expected_format(self, name):
+        """Outputs are of one run from top to bottom, with pictures, without errors and places."""
+        self.assertLess((FOLDER / f'{name}.ipynb').stat().st_size, LARGEST)
         notebook = read(name)
         self.assertEqual((notebook['nbformat'], notebook['nbformat_minor']), (4, 5))
-        self.assertEqual(notebook['metadata'], {
-            'kernelspec': {'display_name': 'Python 3', 'language': 'python', 'name': 'python3'},
-            'language_info': {'name': 'python'},
-        })  # fmt: skip
+        self.assertEqual(notebook['metadata']['language_info'], {'name': 'python'})
         cells = notebook['cells']
         self.assertLen({cell['id'] for cell in cells}, len(cells))
-        for cell in cells:
-            self.assertIn(cell['cell_type'], ('code', 'markdown'))
-            self.assertEqual(cell['metadata'], {})
-            for line in text(cell['source']).splitlines():
-                self.assertLessEqual(len(line), COLUMNS, line)
+        self.assertEqual([cell['metadata'] for cell in cells], [{}] * len(cells))
         self.assertStartsWith(text(cells[0]['source']), '# ')
-
-    @parameterized.parameters(*NAMES)
-    def test_outputs(self, name):
-        """All of one run from top to bottom, with pictures, without errors, warnings and places."""
-        self.assertLess((FOLDER / f'{name}.ipynb').stat().st_size, LARGEST)
-        code = [cell for cell in read(name)['cells'] if cell['cell_type'] == 'code']
+        code = [cell for cell in cells if cell['cell_type'] == 'code']
         self.assertEqual([cell['execution_count'] for cell in code], list(range(1, len(code) + 1)))
-        outputs = [output for cell in code for output in cell['outputs']]
-        self.assertNotEmpty(outputs)
         pictures = 0
-        for output in outputs:
+        for output in (output for cell in code for output in cell['outputs']):
             self.assertIn(output['output_type'], ('stream', 'display_data', 'execute_result'))
             data = output.get('data', {})
             pictures += 'image/jpeg' in data or 'image/png' in data

@@ -1,9 +1,5 @@
 """Random numbers in compiled functions are those of NumPy."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 from absl.testing import absltest, parameterized
 
@@ -62,13 +58,6 @@ class StreamsTest(parameterized.TestCase):
         self.assertGreater(found.max(), 3.66)
         self.assertLess(found.min(), -3.66)
 
-    def test_streams_are_independent(self):
-        streams = seeded(3, 4, 3)
-        before = streams.state.copy()
-        fill_random(1, streams.state, np.empty(5))
-        np.testing.assert_array_equal(streams.state[[0, 2]], before[[0, 2]])
-        self.assertTrue((streams.state[1] != before[1]).any())
-
     def test_python_and_compiled_functions_alternately(self):
         streams, expected = seeded(11), np.random.default_rng(11)
         found = np.empty(7)
@@ -86,30 +75,17 @@ class StreamsTest(parameterized.TestCase):
                 self.assertEqual(generator.bit_generator.state, expected.bit_generator.state)
 
     def test_a_stream_continues_from_a_copy_of_its_state(self):
-        streams, other = seeded(21), seeded(22)
-        with streams.generator(0) as generator:
+        streams, other = seeded(20, 21), seeded(22)
+        with streams.generator(1) as generator:
             generator.integers(3)
-        other.state[0] = streams.state[0]
+        other.state[0], before = streams.state[1], streams.state[0].copy()
         numbers = np.empty((2, 50))
-        for each, out in zip((streams, other), numbers, strict=True):
-            fill_normal(0, each.state, out)
+        for i, each, out in zip((1, 0), (streams, other), numbers, strict=True):
+            fill_normal(i, each.state, out)
         np.testing.assert_array_equal(numbers[0], numbers[1])
-        with streams.generator(0) as first, other.generator(0) as second:
+        with streams.generator(1) as first, other.generator(0) as second:
             self.assertEqual(first.bit_generator.state, second.bit_generator.state)
-
-    def test_the_same_without_compiling(self):
-        script = (
-            'import numpy as np\n'
-            'from trl_suite.util import random\n'
-            'streams, expected = random.Streams(1), np.random.default_rng(6)\n'
-            'streams.seed(0, np.random.SeedSequence(6))\n'
-            'for _ in range(4000):\n'
-            '    assert random.random(0, streams.state) == expected.random()\n'
-            '    assert random.uniform(0, 2.0, 3.0, streams.state) == expected.uniform(2.0, 3.0)\n'
-            '    assert random.standard_normal(0, streams.state) == expected.standard_normal()\n'
-        )
-        environ = {**os.environ, 'NUMBA_DISABLE_JIT': '1'}
-        subprocess.run([sys.executable, '-c', script], check=True, env=environ)
+        np.testing.assert_array_equal(streams.state[0], before)  # streams are independent
 
 
 class DrawTest(parameterized.TestCase):
