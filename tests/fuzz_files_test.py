@@ -31,6 +31,7 @@ from dm_control import mjcf
 from hypothesis import strategies as st
 
 from trl_suite import characters, motion, policies, retargeting, sequences, terrain
+from trl_suite.runs import results, stage
 
 FAST = 30  # changed files of each format
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '2000'))
@@ -318,13 +319,13 @@ def result():
         ['PD_Dog2D_Flat_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'],
     )
     found = {
-        'format': sequences.results.FORMAT, 'trl_suite': '0', 'learner': 'a:B', 'sequence': 'mine',
+        'format': sequences.BENCHMARK.format, 'trl_suite': '0', 'learner': 'a:B', 'sequence': 'mine',
         'ids': ids, 'budget': 9, 'episodes': 2, 'seed': 0, 'initial': [0.1, 0.2], 'scores': scores,
         'samples': [[9, 0], [0, 9]], 'seconds': [1.0, 2.0],
-        'curves': 2 * [[None] * sequences.stage.POINTS],
+        'curves': 2 * [[None] * stage.POINTS],
         'metrics': sequences.metrics(scores, [0.1, 0.2]),
     }  # fmt: skip
-    return {**found, 'digest': sequences.results.digest(found)}
+    return {**found, 'digest': results.digest(found)}
 
 
 def files(folder):

@@ -17,7 +17,7 @@ import torch
 from absl.testing import absltest, parameterized
 
 from trl_suite import evaluation, sequences, suite
-from trl_suite.sequences import results
+from trl_suite.runs import results, running
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
@@ -200,7 +200,7 @@ class StageTest(parameterized.TestCase):
             environments.seed(None)
         with self.assertRaisesRegex(ValueError, 'seed: expected none'):
             self.stage().environments(3, seed=1)
-        with self.assertRaisesRegex(ValueError, "of the sequence 'PD_Dog2D_Walls_Terrain-v0'"):
+        with self.assertRaisesRegex(ValueError, "of the run 'PD_Dog2D_Walls_Terrain-v0'"):
             self.stage().environments(3, 'plaid/dog_walls')
 
     def test_curve(self):
@@ -251,8 +251,8 @@ class Keeper(Counter):
 
 def made_up(cases, episodes, seeds, threads, executor):
     assert min(seeds) >= 2**31 and len(seeds) == episodes
-    for id_, stages in cases:
-        yield {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
+    for spec, stages in cases:
+        yield {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(spec.id)}
 
 
 class RunTest(parameterized.TestCase):
@@ -261,7 +261,7 @@ class RunTest(parameterized.TestCase):
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.path = self.folder / 'result.json'
         self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
-        self.enterContext(mock.patch.object(sequences.running.time, 'perf_counter', lambda: 0.0))
+        self.enterContext(mock.patch.object(running.time, 'perf_counter', lambda: 0.0))
 
     def run_short(self, learner, **changes):
         return sequences.run(SHORT, learner, **{'budget': 7, 'path': self.path, **changes})
@@ -506,7 +506,7 @@ class ResultTest(parameterized.TestCase):
         sequences.check(self.changed('seed', 0))
 
     def test_missing_fields(self):
-        for name in (*results.FIELDS, 'metrics'):
+        for name in (*sequences.BENCHMARK.fields, 'metrics'):
             result = {key: value for key, value in self.result.items() if key != name}
             with self.assertRaisesRegex(ValueError, f'^{name} is missing'):
                 sequences.check(result)
@@ -562,7 +562,7 @@ class CommandTest(cli_test.CommandTest):
             out, f'my_learner:Nothing, plaid_biped.*, {made}: not comparable: budget is 100, not'
         )
         result['learner'] = '\x1b]0;title\x07a\nvalid and comparable'
-        result['digest'] = sequences.results.digest(result)
+        result['digest'] = results.digest(result)
         pathlib.Path('forged.json').write_text(json.dumps(result))
         out = self.output('sequences', 'check', 'forged.json')
         self.assertStartsWith(out, r'forged.json: \x1b]0;title\x07a\nvalid and comparable, plaid')

@@ -12,23 +12,20 @@ A learner is trained on the environments one after the other and is tested on al
 each. All environments of a sequence have the same observation and action spaces, so that one
 network fits all of them.
 
-A sample is one control step of one simulation in training; resets and tests are free. A learner
-gets its simulations from a `Stage`, which counts samples, refuses a step that would exceed the
-budget, and seeds them with training seeds. Seeds below 2**31 are for training, the others, below
-2**32, for tests: `train_seeds` and `test_seeds` never overlap.
+`trl_suite.runs` defines learners, samples, seeds and result files.
 """
 
-from trl_suite.sequences.catalogue import (
-    BUDGETS,
+from trl_suite.runs import (
     EPISODES,
     FIRST_TEST_SEED,
-    SEEDS,
-    SEQUENCES,
-    Sequence,
-    get,
+    BudgetExceededError,
+    Learner,
+    Resumable,
+    Stage,
     test_seeds,
     train_seeds,
 )
+from trl_suite.sequences.catalogue import BENCHMARK, BUDGETS, SEEDS, SEQUENCES, Sequence
 from trl_suite.sequences.metrics import (
     average_performance,
     backward_transfer,
@@ -38,13 +35,14 @@ from trl_suite.sequences.metrics import (
     learning_transfer,
     metrics,
 )
-from trl_suite.sequences.results import check, departures, read
-from trl_suite.sequences.running import Learner, Resumable, run, scores
-from trl_suite.sequences.stage import BudgetExceededError, Stage
+
+get, run, scores = BENCHMARK.get, BENCHMARK.run, BENCHMARK.scores
+read, check, departures = BENCHMARK.read, BENCHMARK.check, BENCHMARK.departures
 
 __all__ = [
-    'BUDGETS', 'EPISODES', 'FIRST_TEST_SEED', 'SEEDS', 'SEQUENCES', 'BudgetExceededError', 'Learner',
-    'Resumable', 'Sequence', 'Stage', 'average_performance', 'backward_transfer', 'check',
-    'departures', 'forgetting', 'forward_transfer', 'get', 'learning_accuracy', 'learning_transfer',
-    'metrics', 'read', 'run', 'scores', 'test_seeds', 'train_seeds',
+    'BENCHMARK', 'BUDGETS', 'EPISODES', 'FIRST_TEST_SEED', 'SEEDS', 'SEQUENCES',
+    'BudgetExceededError', 'Learner', 'Resumable', 'Sequence', 'Stage', 'average_performance',
+    'backward_transfer', 'check', 'departures', 'forgetting', 'forward_transfer', 'get',
+    'learning_accuracy', 'learning_transfer', 'metrics', 'read', 'run', 'scores', 'test_seeds',
+    'train_seeds',
 ]  # fmt: skip

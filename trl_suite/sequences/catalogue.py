@@ -4,45 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
+from trl_suite.runs import Benchmark, Course
+from trl_suite.sequences.metrics import metrics
 
-from trl_suite.registry import catalogue
-from trl_suite.util import errors
-
-FIRST_TEST_SEED = 2**31  # smaller seeds are for training
 BUDGETS = {'small': 100_000, 'full': 1_000_000}  # samples of each stage
-EPISODES = 32  # per test and task
 SEEDS = (0, 1, 2)  # of the runs
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequence:
-    """Environments in the order in which they are learnt.
-
-    Attributes:
-      name: name in `SEQUENCES`, or a custom one.
-      ids: ids of the T environments, without repeats; T >= 2.
-      description: one line.
+class Sequence(Course):
+    """Two or more environments, each learnt in one stage; see `Course`.
 
     Raises:
       ValueError: an id is unknown (the message has the closest matches) or occurs twice, or there
         are fewer than two.
     """
 
-    name: str
-    ids: tuple[str, ...]
-    description: str = ''
-
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'ids', tuple(catalogue.find(id).id for id in self.ids))
-        if len(self) < 2 or len(set(self.ids)) < len(self):
+        super().__post_init__()
+        if len(self) < 2:
             raise ValueError(
-                f'sequence {self.name!r}: expected two or more environments, each once; got '
+                f'sequence {self.name!r}: expected two or more environments; got '
                 f'{", ".join(self.ids)}'
             )
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
 
 # The order of PLAiD (Berseth et al. 2018), then the other terrains of the family.
@@ -66,31 +50,7 @@ SEQUENCES: dict[str, Sequence] = {
     for figure in ('biped', 'dog', 'raptor')
 }
 
-
-def get(name: str) -> Sequence:
-    """Returns a sequence by its name in `SEQUENCES`.
-
-    Raises:
-      ValueError: an unknown name; the message has the closest matches.
-    """
-    errors.check_known('sequence', SEQUENCES, name)
-    return SEQUENCES[name]
-
-
-def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
-    """Returns seeds for training, integers in [0, 2**31), for `VectorEnvironment`.
-
-    Args:
-      count: number of seeds.
-      seed: seed from which these seeds are drawn, e.g. (run, stage).
-    """
-    drawn = np.random.SeedSequence(seed).generate_state(count, np.uint32)
-    return (drawn % FIRST_TEST_SEED).tolist()
-
-
-def test_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
-    """Returns seeds for tests, integers in [2**31, 2**32), for `evaluation.evaluate`.
-
-    The arguments are those of `train_seeds`.
-    """
-    return [FIRST_TEST_SEED + number for number in train_seeds(count, seed)]
+BENCHMARK = Benchmark(
+    'trl_suite sequence 1', 'sequence', SEQUENCES, Sequence, BUDGETS, SEEDS,
+    lambda course, scores, initial: metrics(scores, initial),
+)  # fmt: skip

@@ -11,7 +11,8 @@ import numpy as np
 from trl_suite.environments import arguments
 from trl_suite.environments.vector import Step, VectorEnvironment
 from trl_suite.registry import catalogue
-from trl_suite.sequences.catalogue import FIRST_TEST_SEED, Sequence, train_seeds
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.runs.course import FIRST_TEST_SEED, Course, train_seeds
 from trl_suite.util import errors
 
 POINTS = 20  # of a learning curve
@@ -29,20 +30,21 @@ class Stage:
 
     Attributes:
       id: the environment to be learnt.
-      ids: all environments of the sequence, in order.
-      number: 0 to T - 1.
+      ids: all environments of the run, in order.
+      number: 0 to S - 1, where S is the number of stages.
+      count: S.
       budget: samples that may be taken, in all environments together.
       seed: seed of the run.
       samples: samples taken so far in each environment, (T,) int.
     """
 
     def __init__(
-        self, sequence: Sequence, number: int, budget: int, seed: int = 0, num_threads: int = 0
+        self, course: Course, number: int, budget: int, seed: int = 0, num_threads: int = 0
     ) -> None:
-        self.ids, self.number, self.id = sequence.ids, number, sequence.ids[number]
-        self.budget, self.seed = budget, seed
-        self.samples = np.zeros(len(sequence), int)
-        self._num_threads = num_threads
+        self.ids, self.number, self.id = course.ids, number, course.stages[number]
+        self.count, self.budget, self.seed = len(course.stages), budget, seed
+        self.samples = np.zeros(len(course), int)
+        self._course, self._num_threads = course, num_threads
         self._made = itertools.count()
         self._over = False
         self._returns: list[tuple[int, float]] = []  # samples at the end of an episode, and score
@@ -62,8 +64,8 @@ class Stage:
 
         Args:
           num_envs: number of simulations.
-          id: id or alias of an environment of the sequence; by default the one to be learnt. Which others a learner
-            has used, and how much, is part of its result.
+          id: id or alias of an environment of the run; by default the one to be learnt. Which others a
+            learner has used, and how much, is part of its result.
           options: further arguments of `VectorEnvironment`, such as `autoreset`.
 
         Returns:
@@ -71,15 +73,17 @@ class Stage:
           the budget, and which refuses seeds for tests.
 
         Raises:
-          ValueError: an environment that is not in the sequence, or invalid options.
+          ValueError: an environment that is not in the run, or invalid options.
         """
         id = self.id if id is None else catalogue.find(id).id
-        errors.check_known('environment of the sequence', self.ids, id)
+        errors.check_known('environment of the run', self.ids, id)
         if 'seed' in options:
             raise ValueError('seed: expected none, since the stage draws it from that of the run')
         seeds = train_seeds(num_envs, (self.seed, self.number, next(self._made)))
         options = {'num_threads': self._num_threads, **options}
-        return _Counted(self, self.ids.index(id), id, num_envs, seed=seeds, **options)
+        return _Counted(
+            self, self.ids.index(id), self._course.spec(id), num_envs, seed=seeds, **options
+        )
 
     def spend(self, task: int, count: int) -> None:
         """Counts samples in an environment.
@@ -104,7 +108,7 @@ class Stage:
 
     def record(self, task: int, returns: np.ndarray) -> None:
         """Records the scores of episodes of the environment to be learnt, (k,)."""
-        if task == self.number:
+        if self.ids[task] == self.id:
             now = int(self.samples.sum())
             self._returns += [(now, float(each)) for each in returns]
 
@@ -123,10 +127,12 @@ class Stage:
 class _Counted(VectorEnvironment):
     """Simulations whose steps a stage counts."""
 
-    def __init__(self, stage: Stage, task: int, id: str, num_envs: int, **options: Any) -> None:
+    def __init__(
+        self, stage: Stage, task: int, spec: EnvSpec, num_envs: int, **options: Any
+    ) -> None:
         self._stage, self._number = stage, task
         self._sums = np.zeros(num_envs)
-        super().__init__(id, num_envs, **options)
+        super().__init__(spec, num_envs, **options)
 
     def step(self, action: np.ndarray, env_ids: np.ndarray | Numbers[int] | None = None) -> Step:
         count = (
