@@ -100,13 +100,16 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         self.action_space = action_space(environment, self._dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Starts an episode, seeded if `seed`, in [0, 2**32), is given; there are no options."""
+        """Starts an episode, seeded if `seed`, in [0, 2**32), is given.
+
+        `options` may have the 'level' of the environment's `reset`.
+        """
         if seed is not None:
             arguments.check_seed('seed', seed)
             seed = int(seed)
             self.environment.random_state.seed(seed)
         super().reset(seed=seed)
-        time_step = self.environment.reset()
+        time_step = self.environment.reset((options or {}).get('level'))
         return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
@@ -183,14 +186,14 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     ) -> tuple[Any, Info]:
         """Starts episodes in all simulations, or in those of `options['reset_mask']`.
 
-        They are seeded if `seed` is given.
+        They are seeded if `seed` is given. `options` may have the 'level' of the environment's `reset`.
         """
         env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
         if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
             raise ValueError(
                 f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
             )
-        observation = self.environment.reset(env_ids, seed)
+        observation = self.environment.reset(env_ids, seed, (options or {}).get('level'))
         super().reset(seed=seed if isinstance(seed, int) else None)
         return observation, masked(flat(self.environment.info), env_ids)
 

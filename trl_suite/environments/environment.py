@@ -127,13 +127,19 @@ class Environment(composer.Environment):
         self._has_own_observables = bool(own)
         return composer_observation.Updater(own, 1, True, False)
 
-    def reset(self) -> dm_env.TimeStep:
+    def reset(self, level: int | None = None) -> dm_env.TimeStep:
         """Begins an episode; returns its first time step.
 
+        Args:
+          level: with the option `levels`, the seed of its terrain; drawn if None.
+
         Raises:
+          ValueError: there is no such level.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
         with self.core as core:
+            if level is not None:
+                core.task.choose_level([0], [level])
             core.restart(0)
             self.at_limit = False
             self._show_reward(0.0)
@@ -199,6 +205,12 @@ class Environment(composer.Environment):
           RuntimeError: after `close`.
         """
         return self.core.usable().task
+
+    @property
+    def level(self) -> int | None:
+        """Level of the episode; None without the option `levels`."""
+        levels = self.task.levels
+        return None if levels is None else int(levels.state.level[0])
 
     @property
     def physics(self) -> Any:

@@ -151,16 +151,26 @@ class VectorEnvironment:
                 core.seeds[env_id] = seeds[env_id]
                 core.random[env_id] = np.random.RandomState(int(seeds[env_id]))
 
-    def reset(self, env_ids: Ids = None, seed: int | Sequence[int] | None = None) -> Any:
+    def reset(
+        self,
+        env_ids: Ids = None,
+        seed: int | Sequence[int] | None = None,
+        level: int | Sequence[int] | None = None,
+    ) -> Any:
         """Begins an episode in some simulations, or in all; the others are unchanged.
 
         Args:
           env_ids: simulations in which an episode begins.
           seed: reseeds these simulations first: one seed for all n simulations or n seeds, as for
             the constructor.
+          level: with the option `levels`, the seed of the terrain: one for these simulations, or one
+            for each, in ascending order of their indices; drawn if None.
 
         Returns:
           The observations of all simulations.
+
+        Raises:
+          ValueError: there is no such level, and for invalid arguments.
         """
         with self.core as core:
             ids = arguments.unique_ids(env_ids, self.num_envs)
@@ -168,6 +178,8 @@ class VectorEnvironment:
                 raise ValueError('the first reset must be of all simulations')
             if seed is not None:
                 self.seed(seed, ids)
+            if level is not None:
+                core.task.choose_level(ids, level)
             self.share(self.begin, ids)
             return self._blocks(core.task.seen.observation.astype(self.dtype))
 
@@ -247,6 +259,12 @@ class VectorEnvironment:
             ids = arguments.given_ids([env_id], self.num_envs)
             self._picture.core.write(core.read(ids), [0])
             return rendering.frame(self._picture, **options)
+
+    @property
+    def level(self) -> np.ndarray | None:
+        """Level of the episode of each simulation, (n,); None without the option `levels`."""
+        levels = self.task.levels
+        return None if levels is None else levels.state.level.copy()
 
     @property
     def task(self) -> Task:

@@ -151,8 +151,9 @@ class _Counted(VectorEnvironment):
         self,
         env_ids: np.ndarray | Numbers[int] | None = None,
         seed: int | Numbers[int] | None = None,
+        level: int | Numbers[int] | None = None,
     ) -> Any:
-        observation = super().reset(env_ids, seed)
+        observation = super().reset(env_ids, seed, level)
         self._sums[arguments.unique_ids(env_ids, self.num_envs)] = 0
         return observation
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 # Spawn keys of the streams of components.
-WORLD, PUSH, SENSORS, MOTORS = range(4)
+WORLD, PUSH, SENSORS, MOTORS, LEVELS = range(5)
 
 
 class Component:

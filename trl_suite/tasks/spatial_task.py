@@ -336,7 +336,7 @@ class TrackingTask(SpatialTask):
             self.clock.start[i] = self._start_phase(drawn)
             ground = SpatialGround(
                 self.arena.terrain,
-                drawn_seed(random_state),
+                self.terrain_seed(i, random_state),
                 terrain_level=self.config.terrain_level,
             )
             self._random[i] = np.random.default_rng(drawn_seed(random_state))

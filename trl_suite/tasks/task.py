@@ -7,7 +7,7 @@ import collections
 import functools
 import numbers
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,9 @@ from trl_suite.kinematics.blocks import Block, layout
 from trl_suite.tasks.component import Component, position, seed_of
 from trl_suite.tasks.terms import Outcome, Term, outcome
 from trl_suite.util import errors
+
+if TYPE_CHECKING:
+    from trl_suite.tasks.variation.levels import Levels
 
 MOST_SUBSTEPS = 1000  # physics steps per control step
 MOST_SAMPLES = 10_000  # heights observed on a line
@@ -105,6 +108,7 @@ class Task(composer.Task):
     steps_vary = False  # whether the duration of steps varies, so that it is not 1/30 s
     in_parts = True  # whether several threads may call the task, each for some simulations
     step_in_parts = True  # the same, without components
+    levels: Levels | None = None  # the component that chooses terrain, if there is one
     _begun = False  # whether composer has reset the task, and no step has followed yet
 
     # Methods that a subclass implements.
@@ -240,6 +244,27 @@ class Task(composer.Task):
     def steps_per_call(self) -> int:
         """The least number of physics steps between two controls; see `simulate`."""
         return self._substeps
+
+    def terrain_seed(
+        self, env_id: int, random_state: np.random.RandomState
+    ) -> np.random.SeedSequence:
+        """Draws the seed of an episode's terrain; with levels, it is the level, and the draw has no effect."""
+        drawn = drawn_seed(random_state)
+        if self.levels is None:
+            return drawn
+        return np.random.SeedSequence(int(self.levels.state.level[env_id]))
+
+    def choose_level(self, env_ids: Any, level: int | Sequence[int]) -> None:
+        """Sets the level of the next episode of some simulations.
+
+        Raises:
+          ValueError: the task has no levels, or not this one.
+        """
+        if self.levels is None:
+            raise ValueError(
+                f"level is {level}; expected an environment with the option 'levels', such as (0, 100)"
+            )
+        self.levels.choose(env_ids, level)
 
     def info(self) -> dict[str, Any]:
         """Returns further results by name: arrays of n simulations, or dicts of such arrays."""

@@ -50,7 +50,6 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_simulated,
-    drawn_seed,
 )
 from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import PlanarGround
@@ -278,7 +277,7 @@ class GaitTask(Task):
             rates[k, 0] += 10 * push
             strip = PlanarGround(
                 self.arena.terrain,
-                drawn_seed(random_state),
+                self.terrain_seed(i, random_state),
                 terrain_level=self.config.terrain_level,
                 spawn=self.config.spawn,
                 centre=UPSTREAM_CENTRE,

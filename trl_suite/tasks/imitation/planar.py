@@ -39,7 +39,6 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_position_options,
-    drawn_seed,
     start_phases,
 )
 from trl_suite.tasks.terms import Outcome, begin, conclude, terms_data, wrapped
@@ -370,7 +369,7 @@ class PlanarImitation(Task):
                 # The boundary of the original's segments: it builds them before it moves the root
                 # to 0.
                 centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
-            seed = drawn_seed(random_state)
+            seed = self.terrain_seed(i, random_state)
             strip = PlanarGround(
                 terrain,
                 seed,

@@ -38,7 +38,6 @@ from trl_suite.tasks.common.spatial_rules import (
     tick,
 )
 from trl_suite.tasks.spatial_task import MirroredConfig, TrackingTask
-from trl_suite.tasks.task import drawn_seed
 from trl_suite.tasks.terms import Outcome, conclude
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, packed
@@ -227,7 +226,7 @@ class SpatialImitation(TrackingTask):
             self.clock.start[i] = self._start_phase(drawn)
             ground = SpatialGround(
                 self.arena.terrain,
-                drawn_seed(random_state),
+                self.terrain_seed(i, random_state),
                 terrain_level=self.config.terrain_level,
             )
             self.arena.begin_episode(i, ground)

@@ -311,7 +311,7 @@ class HierarchicalNavigation(SpatialTask):
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             ground = SpatialGround(
                 self.arena.terrain,
-                drawn_seed(random_state),
+                self.terrain_seed(i, random_state),
                 terrain_level=self.config.terrain_level,
             )
             random = self._random[i] = np.random.default_rng(drawn_seed(random_state))

@@ -1,4 +1,4 @@
-"""Components of every task: motors, worlds that vary, pushes, sensors, and users' additions.
+"""Components of every task: levels, motors, worlds that vary, pushes, sensors, and users' additions.
 
     environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={
         'randomize': {'friction': (0.5, 1.2), 'push': {'force': 150, 'interval': 3}},
@@ -13,13 +13,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from trl_suite.actuation import Actuators
 from trl_suite.characters import Character
 from trl_suite.tasks.component import Component
 from trl_suite.tasks.variation import additions
+from trl_suite.tasks.variation import levels as level
 from trl_suite.tasks.variation.motors import Motors
 from trl_suite.tasks.variation.sensors import SensorConfig, Sensors
 from trl_suite.tasks.variation.worlds import WorldConfig, Worlds
@@ -44,12 +45,17 @@ class CommonOptions(Config):
         None, 'limits, delay, noise, strength, free play and elasticity of motors: a dict, see '
         'docs/realism.md',
     )  # fmt: skip
+    levels: Sequence[int] | None = option(
+        None, 'the first level and the number of levels from which every episode draws one; a level is the '
+        'seed of its terrain', at_least=0,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for name in ('randomize', 'sensors'):
             if isinstance(getattr(self, name), Mapping) and not getattr(self, name):
                 self._set(name, None)  # nothing is asked for
         super().__post_init__()
+        level.check(self.levels)
 
 
 def components(
@@ -65,6 +71,8 @@ def components(
     Raises:
       ValueError: invalid additions, or options that do not suit the character.
     """
+    if options.levels is not None:
+        yield level.Levels(options.levels)
     if options.actuators.changed:
         yield Motors(options.actuators, character)
     if any(added.values()):

@@ -34,7 +34,6 @@ from trl_suite.tasks.task import (
     TERRAIN_LEVEL,
     Task,
     check_position_options,
-    drawn_seed,
 )
 from trl_suite.tasks.terms import Outcome, conclude
 from trl_suite.terrain import PlanarGround, SpatialGround
@@ -288,7 +287,7 @@ class Walk(Task):
         self.world.reset(env_ids)
         spawns = np.zeros((count, 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            seed = drawn_seed(random_state)
+            seed = self.terrain_seed(i, random_state)
             if isinstance(self.arena, SpatialArena):
                 ground = SpatialGround(terrain, seed, terrain_level=self.config.terrain_level)
                 spawns[k] = ground.spawn(random_state)
