@@ -35,11 +35,11 @@ class CommonOptions(Config):
 
     randomize: WorldConfig | None = option(
         None, "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a "
-        'dict, see docs/realism_worlds.md',
+        'dict, see docs/realism.md',
     )  # fmt: skip
     sensors: SensorConfig | None = option(
         None, "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
-        'docs/realism_worlds.md',
+        'docs/realism.md',
     )  # fmt: skip
     actuators: Actuators = option(
         None, 'limits, delay, noise, strength, free play and elasticity of motors: a dict, see '
