@@ -2,8 +2,8 @@
 
 The pages are Markdown that reads as well on GitHub. What only the site needs is added here: the
 pages of each environment, family, character and terrain with their navigation and the links to them,
-pages from outside docs/, and moving pictures of the environments:
-`-D moving_pictures='*'`, or another pattern of ids, renders those that are missing.
+pages from outside docs/, and the pictures that are missing, where OpenGL works. `-D moving_pictures='*'`,
+or another pattern of ids, renders moving pictures of the environments, too.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ SUBJECTS = {
     for name in names
 }
 STRIP = re.compile(r'!\[Film strip\]\(\S*/environments/(\S+)\.jpg\)')
+PICTURE = re.compile(r'!\[[^]]*\]\((\S+)\)')
 
 project = 'trl_suite'
 author = copyright = 'the trl_suite developers'
@@ -112,8 +113,13 @@ def read(app: Any, name: str, source: list[str]) -> None:
             return match[0]
         return f'[{match[0]}]({os.path.relpath(DOCS / subject, own.parent)})'
 
-    text = CELL.sub(page_of, LINK.sub(inside, text))
-    source[0] = STRIP.sub(moving, text) + navigation(name)
+    def drawn(match: re.Match[str]) -> str:
+        return match[0] if os.path.exists(os.path.normpath(own.parent / match[1])) else ''
+
+    text = STRIP.sub(moving, CELL.sub(page_of, LINK.sub(inside, text)))
+    if name.partition('/')[0] in generate.SITE:
+        text = PICTURE.sub(drawn, text)
+    source[0] = text + navigation(name)
 
 
 def moving(match: re.Match[str]) -> str:
@@ -145,15 +151,18 @@ def is_code(block: str) -> bool:
 
 
 def render(app: Any) -> None:
-    """Renders moving pictures that are missing, or that show a policy that has been replaced."""
+    """Makes pictures that are missing, or that show a policy that has been replaced."""
     from sphinx.errors import ConfigError  # the tests, which read this file, work without Sphinx
 
-    if not app.config.moving_pictures:
-        return
     try:
-        _, failed = gallery.make(DOCS, app.config.moving_pictures, moves=True)
+        _, failed = gallery.make(DOCS / 'pictures')
+        if app.config.moving_pictures:
+            failed |= gallery.make(DOCS, app.config.moving_pictures, moves=True)[1]
     except ValueError as error:
         raise ConfigError(f'moving_pictures: {error}') from None
+    except RuntimeError as error:
+        print(f'The site has fewer pictures: {error}', file=sys.stderr)
+        return
     for path, error in failed.items():
         raise ConfigError(f'{path}: {error}') from error
 

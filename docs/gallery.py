@@ -1,9 +1,9 @@
 """The pictures of the documentation, which `generate.py` and the configuration of the site make.
 
-Files in the folder: environments/ID.jpg, a film strip; curves/ID.png, for shipped policies;
-terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.webp. Each
-has at most about 40 kB, except the last one and some maps. The site has moving/ID.webp, too, 4 s of
-each environment.
+Files in the folder: characters/NAME.jpg; families/NAME.jpg; suite.webp, which are tracked; and
+environments/ID.jpg, a film strip; curves/ID.png, for shipped policies; terrains/NAME.png, or .jpg in three
+dimensions, which the build of the site makes. Each has at most about 40 kB, except suite.webp and some
+maps. The site can have moving/ID.webp, too, 4 s of each environment.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
 
+BUILT = 'curves', 'environments', 'terrains'  # folders that only the site has
 LARGEST = 40_000  # bytes of a picture
 QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, tried until the file is small enough
 COLOURS = 64  # of a palette
@@ -100,10 +101,10 @@ def items() -> Iterator[Item]:
         yield Item(character_path(name), functools.partial(character, name))
     for name in (*terrains.PRESETS, *terrains.PRESETS3D):
         yield Item(terrain_path(name), functools.partial(terrain, name))
+    for id in filter(record, catalogue.BY_ID):
+        yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
     for id in catalogue.BY_ID:
         yield Item(strip_path(id), functools.partial(film_strip, id), _policy_digest(id))
-        if record(id):
-            yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
 
 
 def moving_items() -> Iterator[Item]:
