@@ -136,7 +136,6 @@ setup(
             'sphinx>=9,<10',
             'sphinx-argparse-cli>=1.20,<2',
             'sphinx-copybutton>=0.5,<1',
-            'sphinx-design>=0.6,<1',
             'gymnasium>=1.1',
             VISER,
         ],

@@ -1,7 +1,7 @@
 """Measures how feet touch the ground, under changes of contacts, servos, feet and rates.
 
     python benchmarks/contacts.py [--episodes 8] [--seed 0] [--json benchmarks/contacts.json]
-        [--page docs/realism.md]
+        [--page docs/reports/robustness.md]
 
 Shipped policies walk on level ground. In every physics step the normal force of the ground on each foot
 is recorded, and from it

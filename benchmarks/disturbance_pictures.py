@@ -1,4 +1,4 @@
-"""Draws what each option of worlds and sensors does, for docs/realism_worlds.md.
+"""Draws what each option of worlds and sensors does, for docs/realism.md.
 
     python benchmarks/disturbance_pictures.py [NAMES ...] [--output docs/pictures/realism]
 

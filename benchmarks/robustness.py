@@ -1,7 +1,7 @@
 """Evaluates the shipped policies under each disturbance of world and sensors at three strengths.
 
     python benchmarks/robustness.py [IDS ...] [--episodes 12] [--seeds 0 1] [--step-limit 128]
-        [--json benchmarks/robustness.json] [--page docs/realism_worlds.md]
+        [--json benchmarks/robustness.json] [--page docs/reports/robustness.md]
 
 Every cell has the same seeds, so that terrain and start of an episode are the same with and without
 the disturbance. The JSON file is written after every cell, and an unfinished run is resumed. The

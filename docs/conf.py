@@ -30,13 +30,12 @@ ROOT = DOCS.parent
 ELSEWHERE = {
     'changelog': ROOT / 'CHANGELOG.md',
     'contributing': ROOT / 'CONTRIBUTING.md',
+    'index': ROOT / 'README.md',
     'notebooks': ROOT / 'colab' / 'README.md',
     'physics_rate': ROOT / 'benchmarks' / 'physics_rate.md',
     'policies': ROOT / 'trained' / 'README.md',
 }
-PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()} | {
-    ROOT / 'README.md': 'index.md',
-}
+PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()}
 LINK = re.compile(r'(?<=\]\()(?![a-z]+:|#)([^)#\s]+)')
 # A cell of a table that is a name, and the pages of environments, characters and others by name.
 CELL = re.compile(r'(?<=\| )`([\w/-]+)`(?= \|)')
@@ -59,14 +58,11 @@ extensions = [
     'sphinx.ext.viewcode',
     'sphinx_argparse_cli',
     'sphinx_copybutton',
-    'sphinx_design',
 ]
 root_doc = 'index'
 templates_path = ['_templates']
 
-myst_enable_extensions = ['colon_fence', 'substitution']
 myst_heading_anchors = 3
-myst_substitutions = {'environments': len(catalogue.SPECS)}
 
 default_role = 'code'
 autodoc_member_order = 'bysource'
@@ -101,7 +97,8 @@ def read(app: Any, name: str, source: list[str]) -> None:
     own, text = DOCS / name, source[0]
     if name in ELSEWHERE:
         app.env.note_dependency(str(ELSEWHERE[name]))
-        text = ELSEWHERE[name].read_text(encoding='utf-8')
+        _, tree, listed = text.partition('```{toctree}')  # that of the index
+        text = ELSEWHERE[name].read_text(encoding='utf-8') + tree + listed
     start = ELSEWHERE.get(name, own).parent
 
     def inside(match: re.Match[str]) -> str:

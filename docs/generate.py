@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import gallery
+import papers
 
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.actuation.muscles import MUSCLES
@@ -30,7 +31,7 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.variation import sensors, worlds
-from trl_suite.util import files, resources
+from trl_suite.util import files
 
 DOCS = pathlib.Path(__file__).resolve().parent
 SOURCES = 'trl_suite', 'trained', 'xml', 'mocap'  # what the pages of the site describe
@@ -57,28 +58,26 @@ WITHOUT = {  # policies shown for environments without a shipped policy
     'clip': 'the clip as joint targets, without feedback (`--policy clip`)',
     'zero': 'action 0 in every step, which is the default gait (`--policy zero`)',
 }
-README = '../README.md'
-# Comments around the sentence of the README that this program writes.
-SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
 SUBSTEPS = 10  # of a control step in benchmarks/vector_environment.py
 MACHINE = (  # that of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
-# A page with tables of options and of costs between such comments.
-REALISM = 'realism_worlds.md'
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
 
 
 def pages() -> dict[str, str]:
     """Returns the text of every page that the repository keeps, by its path below docs/."""
+    tables = {
+        '../README.md': {'solved': solved()},
+        'realism.md': option_tables() | {'cost': cost()},
+        **{f'reports/{name}': found for name, found in papers.tables().items()},
+    }
     return {
         'environments.md': environment_index(),
         'characters.md': character_index(),
         'terrains.md': terrain_index(),
         'speed.md': speed_page(),
-        'leaderboard.md': leaderboard(),
-        REALISM: realism(),
-        README: readme(),
+        **{path: filled(path, found) for path, found in tables.items()},
     }
 
 
@@ -424,86 +423,6 @@ SITE: dict[str, tuple[Callable[[str], str], Iterable[str]]] = {
 }
 
 
-# Leaderboard
-
-
-RESULTS = DOCS / 'leaderboard'  # result files of policies that are not shipped
-EPISODES, EVALUATED_WITH = 50, 0  # least number of episodes, and the seed, of a result
-GAIT_LIMIT = 5000  # cycles
-
-
-def leaderboard() -> str:
-    cells = []
-    for spec in catalogue.SPECS:
-        by = 'distance' if task_type(spec).score == 'distance' else 'normalized_return'
-        results = sorted(results_of(spec), key=lambda named: -named[1][by])
-        cells += [
-            (
-                f'`{spec.id}`', rank, name,
-                '–' if by == 'distance' else f'{result["normalized_return"]:.3f}',
-                f'{result["completion_rate"]:.0%}', f'{result["distance"]:.1f}', result['episodes'],
-            )
-            for rank, (name, result) in enumerate(results, start=1)
-        ]  # fmt: skip
-    return page(
-        'Leaderboard',
-        'All evaluations whose result files are in the repository: those of the shipped policies, of the '
-        'other seeds of their training, and of the default gaits. They are ranked by return, gaits by '
-        'distance.',
-        table(('environment', 'rank', 'policy', 'return', 'complete', 'distance, m', 'episodes'), cells),
-        '*Return*: mean return divided by the step limit, its maximum (not shown for gaits). '
-        '*Complete*: share of the episodes that lasted to the step limit. *Distance*: mean. Confidence '
-        'intervals and training: [Results](results.md).',
-        '## Add a policy',
-        'Store the policy in the format of the [shipped policies](../trained/README.md), and run',
-        '```sh\ntrl-suite evaluate ID --policy NAME.npz --json docs/leaderboard/ID.NAME.json\n'
-        'python docs/generate.py --pages\n```',
-        f'with at least {EPISODES} episodes and the default seed and step limit, except that gaits are '
-        f'evaluated with `--step-limit {GAIT_LIMIT}`; this is checked. Open a pull request with the '
-        'result file, and with the policy or the program that trained it, so that the result can be '
-        'repeated.',
-    )  # fmt: skip
-
-
-def results_of(spec: catalogue.EnvSpec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields the results for an environment with a name for each."""
-    found = gallery.record(spec.id)
-    for run in found['runs'] if found else ():
-        shipped = 'shipped policy, ' * (run['seed'] == found['shipped'])
-        yield f'{shipped}seed {run["seed"]}', run['evaluation']
-    if spec.id in (shared := stored('shared')):
-        entry = shared[spec.id]
-        preference = f', preference {entry["preference"]:g}' if 'preference' in entry else ''
-        yield f'shipped policy of `{entry["policy"]}`{preference}', entry['evaluation']
-    if spec.id in (gaits := stored('default_gaits')):
-        yield 'default gait', gaits[spec.id]
-    for path in sorted(RESULTS.glob(f'{spec.id}.*.json')):
-        yield path.stem.removeprefix(f'{spec.id}.'), submitted(spec, path)
-
-
-@functools.cache
-def stored(name: str) -> dict[str, Any]:
-    """Returns a file of trained/ with results by id."""
-    path = resources.directory('trained') / f'{name}.json'
-    return json.loads(path.read_text(encoding='utf-8'))
-
-
-def submitted(spec: catalogue.EnvSpec, path: pathlib.Path) -> dict[str, Any]:
-    """Reads a result file.
-
-    Raises:
-      ValueError: it does not compare with the other results; the message has the reason.
-    """
-    result = json.loads(path.read_text(encoding='utf-8'))
-    limit = GAIT_LIMIT if task_type(spec).score == 'distance' else spec.step_limit
-    for name, expected in (('id', spec.id), ('seed', EVALUATED_WITH), ('step_limit', limit)):
-        if result.get(name) != expected:
-            raise ValueError(f'{path}: {name} is {result.get(name)!r}; expected {expected!r}')
-    if result['episodes'] < EPISODES:
-        raise ValueError(f'{path}: {result["episodes"]} episodes; expected {EPISODES} or more')
-    return result
-
-
 # Speed
 
 
@@ -516,21 +435,26 @@ def speeds() -> dict[str, Any]:
     return json.loads(path.read_text(encoding='utf-8'))
 
 
-def realism() -> str:
-    """Returns the page on worlds and sensors with its tables."""
+def option_tables() -> dict[str, str]:
+    """Returns the tables of the options of worlds, pushes and sensors."""
     configs = {
         'randomize': worlds.WorldConfig, 'push': worlds.PushConfig, 'sensors': sensors.SensorConfig,
     }  # fmt: skip
-    tables_ = {
+    return {
         f'options of {name}': describe.markdown([options.table_of(config)])
         for name, config in configs.items()
     }
-    tables_['cost'] = cost()
-    text = (DOCS / REALISM).read_text(encoding='utf-8')
-    for name, written in tables_.items():
+
+
+def filled(path: str, tables: dict[str, str]) -> str:
+    """Returns a page with its tables written between comments with their names."""
+    text = (DOCS / path).read_text(encoding='utf-8')
+    for name, written in tables.items():
         start, end = f'<!-- {name}, written by docs/generate.py -->', f'<!-- /{name} -->'
-        before, _, rest = text.partition(start)
-        text = f'{before}{start}\n{written}\n{end}{rest.partition(end)[2]}'
+        (before, begun, _), (_, ended, after) = text.partition(start), text.partition(end)
+        if not (begun and ended):
+            raise ValueError(f'{path}: expected the lines {start!r} and {end!r}')
+        text = f'{before}{start}\n{written}\n{end}{after}'
     return text
 
 
@@ -553,13 +477,6 @@ def cost() -> str:
     )
 
 
-def readme() -> str:
-    """Returns README.md with the scores of the shipped policies."""
-    text = (DOCS / README).read_text(encoding='utf-8')
-    (start, end), (before, _, rest) = SOLVED, text.partition(SOLVED[0])
-    return f'{before}{start}\n{solved()}\n{end}{rest.partition(end)[2]}'
-
-
 def solved() -> str:
     """Returns a sentence with the scores of the shipped policies by family."""
     scores: dict[str, list[float]] = {domain: [] for domain in catalogue.FAMILIES}
@@ -568,8 +485,8 @@ def solved() -> str:
         score = task_type(spec).score
         if score == 'distance':
             gaits.add(spec.domain)
-        if spec.id in stored('shared'):
-            scores[spec.domain].append(stored('shared')[spec.id]['evaluation'][score])
+        if spec.id in papers.stored('shared'):
+            scores[spec.domain].append(papers.stored('shared')[spec.id]['evaluation'][score])
         elif entry := gallery.record(spec.id):
             run = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
             scores[spec.domain].append(run['evaluation'][score])
@@ -579,8 +496,7 @@ def solved() -> str:
     )
     said = (
         f'{sum(map(len, scores.values()))} of {len(catalogue.SPECS)} environments have a trained policy. Median '
-        f'scores: {medians}. A score is the return as a share of its maximum, and for gaits the distance to the '
-        f'first fall within {GAIT_LIMIT} cycles. Each policy: [docs/results.md](docs/results.md).'
+        f'[scores](docs/results.md): {medians}.'
     )
     return textwrap.fill(said, 112, break_on_hyphens=False)
 

@@ -1,4 +1,4 @@
-"""Tests of how feet touch the ground: what `benchmarks/contacts.py` measures, and docs/realism.md states."""
+"""Tests of how feet touch the ground: what `benchmarks/contacts.py` measures, and docs/reports/robustness.md states."""
 
 import pathlib
 import sys

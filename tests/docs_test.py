@@ -22,6 +22,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
 import conf
 import gallery
 import generate
+import papers
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -90,6 +91,19 @@ class PagesTest(parameterized.TestCase):
         terrains = self.page('terrains/injectinput_slopes.md')
         self.assertIn('\n## Parameters\n\n| parameter | unit | value |', terrains)
 
+    @parameterized.parameters(
+        'docs/quick_start',
+        'docs/concepts',
+        'docs/realism',
+        'docs/reports/robustness',
+    )
+    def test_code_runs(self, name):
+        text = (ROOT / f'{name}.md').read_text(encoding='utf-8')
+        code = '\n'.join(re.findall('```python\n(.*?)```', text, re.DOTALL))
+        self.assertNotEmpty(code)
+        with contextlib.redirect_stdout(io.StringIO()):
+            exec(compile(code, f'{name}.md', 'exec'), {'__name__': 'page'})
+
     def page(self, path):
         """Returns the text of a page of the site, all of whose links have targets."""
         pages = generate.site_pages()
@@ -135,6 +149,47 @@ class PagesTest(parameterized.TestCase):
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
+
+
+class TablesTest(FolderTest):
+    def test_text_between_comments(self):
+        page = self.folder / 'page.md'
+        page.write_text('a\n<!-- b, written by docs/generate.py -->\nold\n<!-- /b -->\nc\n')
+        with mock.patch.object(generate, 'DOCS', self.folder):
+            text = 'a\n<!-- b, written by docs/generate.py -->\nnew\n<!-- /b -->\nc\n'
+            self.assertEqual(generate.filled('page.md', {'b': 'new'}), text)
+            with self.assertRaisesRegex(ValueError, "page.md: expected the lines '<!-- d, written"):
+                generate.filled('page.md', {'d': 'new'})
+
+    def test_returns_and_area_under_the_curve(self):
+        curve = [(100, 0.5), (200, 1.0), (300, 1.0)]
+        run = {
+            'curve': [{'samples': x, 'normalized_return': y} for x, y in curve],
+            'evaluation': {'returns': [90.0, 110.0], 'step_limit': 200},
+        }
+        self.assertEqual(papers.returns([run], 200), '.500 ± .050 (.500)')
+        self.assertEqual(papers.returns([], 200), '–')
+        self.assertEqual([papers.figure(value) for value in (-0.0664, 1.5)], ['-.066', '1.500'])
+
+    def test_tables_show_what_is_stored(self):
+        """The last return of PLAiD's biped on gaps, and the changes by the stages after the first."""
+        scores = [
+            json.loads(path.read_text())['scores']
+            for path in (DOCS / 'continual' / 'plaid_biped').glob('Plaid_s*.json')
+        ]
+        last, flat = (
+            np.mean([each[4][4] for each in scores]),
+            np.mean([each[0][0] for each in scores]),
+        )
+        change = np.mean([each[4][0] for each in scores]) / flat - 1
+        final, changed = papers.plaid(0), papers.plaid(1)
+        self.assertRegex(
+            final,
+            rf'published \| \.891.*\n\|  \| our biped .* \| {papers.figure(last)} \| \S+ \|\n',
+        )
+        self.assertRegex(
+            changed, rf'published \| \.054.*\n\|  \| our biped \| {papers.figure(change)} '
+        )
 
 
 class SitePagesTest(FolderTest):
@@ -232,31 +287,6 @@ class GalleryTest(FolderTest):
             gallery.save(noise, path.with_suffix('.gif'))
 
 
-class LeaderboardTest(FolderTest):
-    ID = 'PD_Biped2D_Flat-v0'
-
-    def test_the_command_of_the_page_finds_its_folder(self):
-        text = (DOCS / 'leaderboard.md').read_text(encoding='utf-8')
-        folder = re.search(r'--json (\S+)/ID', text)[1]
-        self.assertTrue((ROOT / folder).is_dir())
-        self.assertEqual(ROOT / folder, generate.RESULTS)
-
-    def test_a_result_file_becomes_a_row(self):
-        result = {
-            'id': self.ID, 'seed': 0, 'step_limit': 256, 'episodes': 50, 'normalized_return': 0.5,
-            'completion_rate': 0.75, 'distance': 9.0,
-        }  # fmt: skip
-        path = self.folder / f'{self.ID}.mine.json'
-        with mock.patch.object(generate, 'RESULTS', self.folder):
-            path.write_text(json.dumps(result), encoding='utf-8')
-            self.assertRegex(
-                generate.leaderboard(), rf'{self.ID}.* \| mine \| 0.500 \| 75% \| 9.0 \| 50 \|'
-            )
-            path.write_text(json.dumps({**result, 'episodes': 49}), encoding='utf-8')
-            with self.assertRaisesRegex(ValueError, 'mine.json: 49 episodes; expected 50 or more'):
-                generate.leaderboard()
-
-
 class WordsTest(parameterized.TestCase):
     @parameterized.parameters(
         'PD_Dog2D_Gaps_Terrain-v0', 'FSM_Raptor2D_Terrain_Walls-v0', 'PD_Biped3D_HLC_LargeBlocks-v0'
@@ -345,9 +375,7 @@ class SiteTest(absltest.TestCase):
 
     def test_every_page_is_in_the_navigation(self):
         index = (DOCS / 'index.md').read_text(encoding='utf-8')
-        listed = {
-            f'{name}.md' for name in re.findall(r'^[a-z_]+(?:/README)?$', index, re.MULTILINE)
-        }
+        listed = {f'{name}.md' for name in re.findall(r'^[a-z_]+(?:/\w+)?$', index, re.MULTILINE)}
         pages = {path.relative_to(DOCS).as_posix() for path in tracked_pages()}
         pages |= {*generate.site_pages()}
         for page in pages:
@@ -355,9 +383,7 @@ class SiteTest(absltest.TestCase):
                 f'{(DOCS / page).parent.joinpath(below).resolve().relative_to(DOCS)}'
                 for below in conf.navigation(page.removesuffix('.md')).splitlines()[3:-1]
             }
-        self.assertEqual(
-            pages - listed - {'README.md', 'index.md', 'clients.md', 'cluster.md'}, set()
-        )
+        self.assertEqual(pages - listed - {'README.md', 'index.md'}, set())
 
 
 if __name__ == '__main__':

@@ -15,6 +15,7 @@ from unittest import mock
 import imageio.v3 as imageio
 import mujoco
 import numpy as np
+import own_clip_test
 import trimesh
 from absl.testing import absltest, parameterized
 
@@ -1020,6 +1021,9 @@ class ExampleTest(Folder):
     def test_code_of_the_page_runs(self):
         page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')
         code = '\n'.join(re.findall('```python\n(.*?)```', page, re.DOTALL))
+        clip = motion.load(characters.CHARACTERS['biped3d_full_mocap'].clip)
+        figure = own_clip_test.Figure('biped3d_full_mocap', clip, frames=61)
+        own_clip_test.write_bvh(figure, self.folder / 'walk.bvh')
         with contextlib.chdir(self.folder):
             exec(compile(code, 'make_your_own.md', 'exec'), {'__name__': 'page'})
 

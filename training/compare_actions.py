@@ -3,7 +3,7 @@
     python training/compare_actions.py                     # one seed
     python training/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json
     python training/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json \
-        --page docs/findings.md --picture docs/pictures/gait_actions.png
+        --page docs/reports/terrain_adaptive_gaits.md --picture docs/pictures/gait_actions.png
 
 Every result is a run with the same number of cycles: of `learn_gaits.py` with its default settings and
 random first actions instead of those of a shipped policy, or of `ppo.py`. The policy is then evaluated

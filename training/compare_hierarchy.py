@@ -2,7 +2,7 @@
 
     python training/compare_hierarchy.py --seeds 1                  # one seed
     python training/compare_hierarchy.py --json benchmarks/hierarchy.json \
-        --page docs/findings.md --picture docs/pictures/hierarchy.png
+        --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
 
 As Figure 9 of Peng et al. (2017), for the trail and for soccer: PPO with the same number of control
 steps of 1/30 s. A policy with hierarchy plans two footsteps, about every 15 control steps; its network

@@ -2,7 +2,7 @@
 
     python training/compare_limits.py                             # one seed, few samples
     python training/compare_limits.py --seeds 1 2 3 --samples 1e6  # 36 runs
-    python training/compare_limits.py --page docs/realism.md
+    python training/compare_limits.py --page docs/reports/robustness.md
 
 Every cell is a run of `ppo.py` with the settings of the environment, except for the number of samples, which
 is the same for all, and the limits, which hold in training and evaluation. Finished cells are kept in

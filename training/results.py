@@ -41,7 +41,7 @@ PLANS = (  # tag, title, text
         'flat_control',
         '## The same tasks without hierarchy',
         'The same program and episodes. The policies imitate planned footsteps and the controller that tracks '
-        'them; with PPO alone: [comparison with the papers](findings.md#without-hierarchy). The reward includes '
+        'them; with PPO alone: [DeepLoco](reports/deeploco.md#without-hierarchy). The reward includes '
         'imitation of the clip. Goals are reached within 0.5 m instead of 1 m, and on the trail they are one '
         'segment of 2 m ahead instead of up to ten; in soccer, speed is towards the ball.',
     ),
@@ -265,7 +265,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments: '
         '`suite.reference_policy(id)`. This page is written by `training/results.py` from the '
         f'{len(runs)} runs in `trained/`, which `training/train_all.py` repeats. A `note` in the file of a run says '
-        'where it differs from the settings there. Claims of the papers: [comparison with the papers](findings.md).',
+        'where it differs from the settings there. Claims of the papers: [reports](reports/README.md).',
         f'Policies are evaluated without noise, in {" or ".join(map(str, episodes))} episodes (gaits on other '
         'terrains: column *episodes*) that are used neither in training nor to select a policy of the curve. Of '
         'several seeds the best one in these episodes is shipped; all seeds: *Actuation models*. *Return* is '

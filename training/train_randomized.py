@@ -2,7 +2,7 @@
 
     python training/train_randomized.py                       # all that are missing
     python training/train_randomized.py Torque_Dog2D_LLC_Imitate_Flat-v0 --overwrite
-    python training/train_randomized.py --page docs/realism_worlds.md  # also writes its table
+    python training/train_randomized.py --page docs/reports/robustness.md  # also writes its table
 
 Each run is `training/ppo.py` on one thread, with the settings `RANDOMIZED` of `ppo_settings.py`,
 starting from the shipped policy. Interrupted runs continue from their checkpoints in RUNS. The policy

@@ -1,0 +1,153 @@
+"""Tables of docs/reports/: published figures, and ours beside them from the results in the repository."""
+
+from __future__ import annotations
+
+import functools
+import json
+import pathlib
+from collections.abc import Iterable
+from typing import Any
+
+import gallery
+import numpy as np
+
+from trl_suite import describe
+from trl_suite.util import resources
+
+RUNS = pathlib.Path(__file__).resolve().parent / 'continual'
+# Action spaces (2017), supplement, table 4: normalised reward, mean ± standard deviation over 32
+# episodes, and in brackets the normalised area under the learning curve.
+MODELS = {'Torque': 'torque', 'Vel': 'velocity', 'PD': 'PD', 'MTU': 'muscle'}
+MOTIONS = {
+    'biped walk': ('Biped2D_LLC_Imitate_Flat-v0', (
+        '.766 ± .312 (.479)', '.952 ± .003 (.631)', '.952 ± .003 (.700)', '.958 ± .007 (.717)')),
+    'biped run': ('Biped2D_LLC_Imitate_Run_Flat-v0', (
+        '.903 ± .010 (.694)', '.907 ± .011 (.730)', '.906 ± .006 (.788)', '.899 ± .009 (.536)')),
+    'raptor run': ('Raptor2D_LLC_Imitate_Flat-v0', (
+        '.614 ± .009 (.381)', '.873 ± .004 (.701)', '.955 ± .001 (.837)', '.953 ± .002 (.726)')),
+    'dog bound': ('Dog2D_LLC_Imitate_Flat-v0', (
+        '.789 ± .005 (.490)', '.979 ± .004 (.786)', '.980 ± .001 (.928)', '.903 ± .003 (.683)')),
+}  # fmt: skip
+# PLAiD (2018), tables 1 and 2, by terrain and their average.
+TERRAINS = 'flat', 'incline', 'steps', 'slopes', 'gaps', 'average'
+LEARNERS = {  # ours: name of the result files, final rewards, changes
+    'PLAiD': ('Plaid', '.891 .800 .666 .602 .529 .698', '.054 .155 .001 .043 -.083 .063'),
+    'TL-Only': ('FineTuning', '.790 .662 .615 .543 .626 .647', '-.065 -.044 -.235 -.242 .000 -.147'),
+    'TL-Only with distillation': ('', '.903 .719 .781 .671 .543 .723', '.068 .039 -.030 -.062 -.133 -.024'),
+    'MultiTasker': ('MultiTask', '.844 .757 .677 .656 .504 .688', '-.001 -.053 -.030 .119 .000 .009'),
+}  # fmt: skip
+GAITS = (
+    'Dog2D_Terrain_Mixed', 'Dog2D_Terrain_Slopes_Mixed', 'Dog2D_Terrain_Narrow_Gaps',
+    'Dog2D_Terrain_Tight_Gaps', 'Raptor2D_Terrain_Mixed', 'Raptor2D_Terrain_Slopes_Mixed',
+    'Raptor2D_Terrain_Narrow_Gaps', 'Goat2D_Terrain_Variable_Steps', 'Goat2D_Terrain_Cliffs',
+    'Hopper2D_Terrain_Mixed', 'Biped2D_Terrain_Mixed', 'Dog2D_Terrain_Stairs_Rugged',
+)  # fmt: skip
+CONDITIONS = (
+    'straight', 'general', 'bumps of 6 cm', 'belts of 0.6 m/s', 'pushes of 150 N', 'pushes of 250 N',
+)  # fmt: skip
+
+
+@functools.cache
+def stored(name: str) -> dict[str, Any]:
+    """Returns a JSON file of trained/."""
+    path = resources.directory('trained') / f'{name}.json'
+    return json.loads(path.read_text(encoding='utf-8'))
+
+
+def tables() -> dict[str, dict[str, str]]:
+    """Returns the tables of each page in docs/reports/, by name."""
+    return {
+        'action_spaces.md': {'returns': action_spaces()},
+        'plaid.md': {'final rewards': plaid(0), 'changes': plaid(1)},
+        'terrain_adaptive_gaits.md': {'distances': gaits()},
+        'deeploco.md': {'footsteps': footsteps(), 'plans': plans()},
+    }
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    found = [tuple(row) for row in rows]
+    return describe.markdown_table(describe.Table(tuple(header), found), plain=True)
+
+
+def figure(value: float) -> str:
+    """Writes a share as the papers do: .952."""
+    return f'{value:.3f}'.replace('0.', '.', 1)
+
+
+def action_spaces() -> str:
+    rows = []
+    for motion, (name, published) in MOTIONS.items():
+        records = [gallery.record(f'{model}_{name}') for model in MODELS]
+        runs = [record['runs'] if record else [] for record in records]
+        samples = min(run['curve'][-1]['samples'] for each in runs for run in each)
+        rows += [
+            (motion, 'published', *published),
+            ('', f'ours, {samples / 1e6:.1f} M', *(returns(each, samples) for each in runs)),
+        ]  # fmt: skip
+    return table(('motion', '', *MODELS.values()), rows)
+
+
+def returns(runs: list[dict[str, Any]], samples: int) -> str:
+    """Returns mean and deviation over the episodes of all seeds, and the area up to `samples`."""
+    if not runs:
+        return '–'
+    results = [run['evaluation'] for run in runs]
+    shares = np.concatenate([np.divide(each['returns'], each['step_limit']) for each in results])
+    areas = []
+    for run in runs:
+        points = [(0, 0.0)]  # nothing is gained before the first evaluation
+        points += [(each['samples'], each['normalized_return']) for each in run['curve']]
+        x, y = np.transpose([each for each in points if each[0] <= samples])
+        areas.append(np.trapezoid(y, x) / x[-1])
+    return f'{figure(shares.mean())} ± {figure(shares.std())} ({figure(np.mean(areas))})'
+
+
+def plaid(kind: int) -> str:
+    """Returns final rewards (0), or how later stages change them (1)."""
+    rows = []
+    for learner, (name, *published) in LEARNERS.items():
+        rows.append((learner, 'published', *published[kind].split()))
+        for character in ('biped', 'dog', 'raptor') if name else ():
+            paths = sorted((RUNS / f'plaid_{character}').glob(f'{name}_s*.json'))
+            scores = np.mean([json.loads(path.read_text())['scores'] for path in paths], axis=0)
+            final, own = scores[-1], scores.diagonal()  # after all stages, after its own stage
+            values = final / own - 1 if kind else final
+            rows.append(('', f'our {character}', *map(figure, (*values, values.mean()))))
+    return table(('learner', '', *TERRAINS), rows)
+
+
+def gaits() -> str:
+    rows = []
+    for name in GAITS:
+        id = f'FSM_{name}-v0'
+        if id in stored('shared'):
+            found = stored('shared')[id]['evaluation']
+        else:
+            record = stored(id)
+            found = next(
+                run['evaluation'] for run in record['runs'] if run['seed'] == record['shipped']
+            )
+        low, high = found['distance_interval']
+        default = stored('default_gaits').get(id, {}).get('distance')
+        rows.append((
+            f'`{id}`', f'{found["distance"]:.0f} ({low:.0f} to {high:.0f})',
+            '–' if default is None else f'{default:.0f}',
+        ))  # fmt: skip
+    return table(('environment', 'distance, m', 'default gait, m'), rows)
+
+
+def footsteps() -> str:
+    found = stored('footsteps')['conditions']
+    return table(
+        ('footstep controller', 'no fall', 'landing error, m'),
+        ((name, f'{found[name]["survived"]:.0%}', f'{found[name]["landing"]:.3f}') for name in CONDITIONS),
+    )  # fmt: skip
+
+
+def plans() -> str:
+    rows = [
+        (f'`{id}`', *(f'{found[policy]["reward"]:.2f}' for policy in ('scripted', 'reference')),
+         f'{found["reference"]["survived"]:.0%}')
+        for id, found in stored('plans').items() if 'scripted' in found
+    ]  # fmt: skip
+    return table(('planner', 'score, hand-written', 'score, trained', 'no fall in 200 s'), rows)
