@@ -1,6 +1,8 @@
 """The pages in docs/ and the README: up to date, with existing link targets; their pictures."""
 
+import builtins
 import contextlib
+import importlib.util
 import io
 import json
 import os
@@ -27,6 +29,7 @@ import papers
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+FOLDERS = 'trl_suite', 'tests', 'docs', 'training', 'benchmarks', 'colab', 'trained', '.ci', 'xml'
 LARGEST = 3e6  # bytes of the pictures that the repository keeps
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
 
@@ -92,6 +95,7 @@ class PagesTest(parameterized.TestCase):
         self.assertIn('\n## Parameters\n\n| parameter | unit | value |', terrains)
 
     @parameterized.parameters(
+        'CONTRIBUTING',
         'docs/quick_start',
         'docs/concepts',
         'docs/realism',
@@ -116,7 +120,7 @@ class PagesTest(parameterized.TestCase):
 
     def test_links_have_targets(self):
         """Every link target of a page is in the repository, and is not empty."""
-        for file in (ROOT / 'README.md', *tracked_pages()):
+        for file in (ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *tracked_pages()):
             for link in _LINK.findall(file.read_text(encoding='utf-8')):
                 target = (file.parent / link).resolve()
                 self.assertTrue(target.exists(), f'{file}: {link}')
@@ -190,6 +194,29 @@ class TablesTest(FolderTest):
         self.assertRegex(
             changed, rf'published \| \.054.*\n\|  \| our biped \| {papers.figure(change)} '
         )
+
+
+class ContributingTest(absltest.TestCase):
+    text = re.sub('```.*?```', '', (ROOT / 'CONTRIBUTING.md').read_text('utf-8'), flags=re.DOTALL)
+    files = (*ROOT.glob('*.*'), *(path for name in FOLDERS for path in (ROOT / name).rglob('*.*')))
+
+    def test_names_are_defined(self):
+        sources = [path for path in self.files if path.suffix == '.py']
+        code = '\n'.join(path.read_text('utf-8') for path in sources)
+        modules = {name for path in sources for name in (path.stem, path.parent.name)}
+        names = set(re.findall(r'`(?:\w+\.)*([A-Za-z]\w+)`', self.text))
+        self.assertContainsSubset({'load', 'build_task', 'finish_step', 'EnvSpec'}, names)
+        for name in names - modules - {'md', 'py', 'json', 'toml', *dir(builtins)}:
+            if importlib.util.find_spec(name) is None:
+                self.assertRegex(code, rf'(?m)^ *((def|class) {name}\b|{name}(: .*)? = )')
+
+    def test_files_exist(self):
+        found = re.findall(r'`(?:python )?([\w./]+(?:/|\.(?:py|json|md)))[` ]', self.text)
+        paths = [f'/{path.relative_to(ROOT).as_posix()}' for path in self.files]
+        self.assertIn('registry/build.py', found)
+        for name in found:
+            if 'NAME' not in name:
+                self.assertTrue(any(f'/{name}' in path for path in paths), name)
 
 
 class SitePagesTest(FolderTest):
