@@ -26,8 +26,8 @@ from trl_suite import evaluation, policies, sequences
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import ppo
-import ppo_settings
 import train_all
+from settings import settings_for
 
 # Ray that is started on this machine makes a token, and would then send it to the clusters of these
 # tests, which have none.
@@ -226,10 +226,8 @@ class TrainingTest(TwoNodes):
         return entered(folder / 'trained')
 
     def test_runs_survive_the_loss_of_a_node(self):
-        settings = ppo_settings.settings_for
-        self.enterContext(
-            mock.patch.object(ppo, 'settings_for', lambda id_, **_: settings(id_, **self.SETTINGS))
-        )
+        short = lambda id_, **_: settings_for(id_, **self.SETTINGS)  # noqa: E731
+        self.enterContext(mock.patch.object(ppo, 'settings_for', short))
         local, remote = self.folder(), self.folder()
         one = lambda *_, **__: concurrent.futures.ProcessPoolExecutor(  # noqa: E731
             1, multiprocessing.get_context('spawn'), max_tasks_per_child=1

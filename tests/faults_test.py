@@ -30,16 +30,16 @@ from trl_suite.util import files, program
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
-import checkpoints
 import gallery
 import ppo
-import ppo_settings
+import runs
+from settings import Settings
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '10'))  # rounds
 SEQUENCE = sequences.Sequence('two', ('plaid/dog_flat', 'plaid/dog_steps'))
-SETTINGS = ppo_settings.Settings(
+SETTINGS = Settings(
     samples=512, num_envs=8, horizon=8, minibatch=32, hidden=(16, 16), evaluate_every=128,
     evaluation_episodes=2,
 )  # fmt: skip
@@ -205,7 +205,7 @@ def content(path):
         found = sequences.read(path, complete=False)
         return {name: found[name] for name in found if name not in ('seconds', 'digest')}
     if path.name == 'checkpoint.pt':
-        return checkpoints.load(path)['samples']
+        return runs.load(path)['samples']
     if path.suffix == '.npz':
         return (policy if path.parent.name == 'run' else arrays)(path)
     if path.suffix == '.mp4':

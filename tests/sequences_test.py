@@ -22,8 +22,7 @@ from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
-import continual_baselines
-import plaid
+import continual
 
 SHORT = sequences.Sequence('short', ('plaid/dog_flat', 'plaid/dog_steps', 'plaid/dog_gaps'))
 
@@ -609,12 +608,12 @@ class BaselinesTest(parameterized.TestCase):
     def setUp(self):
         super().setUp()
         self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
-        self.enterContext(mock.patch.object(continual_baselines, 'NUM_ENVS', 8))
-        settings = continual_baselines.ppo_settings.settings_for
+        self.enterContext(mock.patch.object(continual, 'NUM_ENVS', 8))
+        settings = continual.settings.settings_for
         small = {'hidden': (16, 16), 'minibatch': 128, 'cloning_epochs': 2}
         self.enterContext(
             mock.patch.object(
-                continual_baselines.ppo_settings, 'settings_for',
+                continual.settings, 'settings_for',
                 lambda id_, **k: settings(id_, **{**k, **small}),
             )
         )  # fmt: skip
@@ -636,11 +635,11 @@ class BaselinesTest(parameterized.TestCase):
         )
 
     @parameterized.parameters(
-        (continual_baselines.Scratch, np.eye(3)),
-        (continual_baselines.FineTuning, np.eye(3)),
-        (continual_baselines.EWC, np.eye(3)),
-        (continual_baselines.MultiTask, np.ones((3, 3))),
-        (plaid.Plaid, np.tri(3)),
+        (continual.Scratch, np.eye(3)),
+        (continual.FineTuning, np.eye(3)),
+        (continual.EWC, np.eye(3)),
+        (continual.MultiTask, np.ones((3, 3))),
+        (continual.Plaid, np.tri(3)),
     )
     @pytest.mark.slow  # .ci/run runs these
     def test_every_stage_trains_in_its_own_environments(self, kind, expected):
@@ -652,7 +651,7 @@ class BaselinesTest(parameterized.TestCase):
         self.assertEqual(sequences.read('result.json'), result)
         self.assertNotEqual(result['scores'][0], result['initial'])
 
-    @parameterized.parameters(continual_baselines.FineTuning, continual_baselines.EWC, plaid.Plaid)
+    @parameterized.parameters(continual.FineTuning, continual.EWC, continual.Plaid)
     @pytest.mark.slow
     def test_a_stopped_run_resumes_exactly(self, kind):
         _, whole = self.run_short(kind, 'whole')
@@ -671,7 +670,7 @@ class BaselinesTest(parameterized.TestCase):
 
     def test_scratch_forgets_everything(self):
         """Trained twice on one environment, it begins with the same weights."""
-        learner = continual_baselines.Scratch(SHORT, 0)
+        learner = continual.Scratch(SHORT, 0)
         first = learner.policy().weights[1]
         learner.train(sequences.Stage(SHORT, 0, 600, 0, 1))
         self.assertFalse(np.array_equal(learner.policy().weights[1], first))
@@ -680,13 +679,13 @@ class BaselinesTest(parameterized.TestCase):
 
     def test_fisher_information_of_a_linear_policy(self):
         """For a mean W s and deviations sigma it is E[s_j^2] / sigma_i^2 for W[i, j]."""
-        learner = continual_baselines.EWC(SHORT, 0)
+        learner = continual.EWC(SHORT, 0)
         trainer = learner.trainer
         trainer.policy = torch.nn.Linear(2, len(trainer.log_std), bias=False)
         with torch.no_grad():
             trainer.log_std.copy_(torch.linspace(-1, 0, len(trainer.log_std)))
         observations = torch.tensor([[1.0, 2.0], [3.0, 0.0]]).repeat(5000, 1)
-        with mock.patch.object(continual_baselines, 'FISHER_SAMPLES', len(observations)):
+        with mock.patch.object(continual, 'FISHER_SAMPLES', len(observations)):
             learner.consolidate(observations)
         squares = torch.tensor([[5.0, 2.0]])
         expected = squares / trainer.log_std.detach().exp()[:, None] ** 2
@@ -694,21 +693,21 @@ class BaselinesTest(parameterized.TestCase):
         # Half the sum of importance times squared change.
         with torch.no_grad():
             trainer.policy.weight[0, 1] += 0.1
-        penalty = continual_baselines.STRENGTH * 0.5 * learner.fisher['weight'][0, 1] * 0.01
+        penalty = continual.STRENGTH * 0.5 * learner.fisher['weight'][0, 1] * 0.01
         torch.testing.assert_close(learner.penalty().detach(), penalty)
 
     def test_distillation_gives_each_expert_its_terrain(self):
         """Two experts with constant actions, on terrains that the labels tell apart."""
-        learner = plaid.Plaid(SHORT, 0)
+        learner = continual.Plaid(SHORT, 0)
         stage = sequences.Stage(SHORT, 1, 600, 0, 1)
-        environments = continual_baselines.together(stage, SHORT.ids[:2])
+        environments = continual.together(stage, SHORT.ids[:2])
         labels = []
         size = len(environments.action_map)
         experts = [lambda o, a=a: np.full((len(o), size), a) for a in (0.5, -2.0)]
         learner.trainer.fit = lambda seen, actions: labels.append(
             (sum(map(len, seen)), np.concatenate(actions))
         )
-        plaid.distil(learner.trainer, environments, experts, 600, rounds=3)
+        continual.distil(learner.trainer, environments, experts, 600, rounds=3)
         self.assertEqual([count for count, _ in labels], [200, 400, 600])
         each = labels[-1][1].reshape(-1, 2, 4, size)
         np.testing.assert_array_equal(each[:, 0], 0.5)

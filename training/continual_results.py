@@ -16,22 +16,23 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+from pages import DOCS, picture, table
 from scipy import special
 
 from trl_suite import sequences
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
 
-DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 FOLDER = DOCS / 'continual'
 BEGIN, END = '<!-- results, written by training/continual_results.py -->', '<!-- /results -->'
-NONE = 'No run with a budget of the benchmark has been stored yet.'
 LEARNERS = ('Scratch', 'FineTuning', 'EWC', 'Plaid', 'MultiTask')  # the order of tables and colours
 REFERENCE = 'Scratch'
 COLUMNS = (
     'average_performance', 'learning_accuracy', 'forgetting', 'backward_transfer',
     'forward_transfer', 'learning_transfer',
 )  # fmt: skip
+Result = dict[str, Any]
+Runs = dict[str, dict[int, Result]]  # learner -> seed -> result
 
 
 def interval(values: Iterable[float]) -> str:
@@ -43,14 +44,14 @@ def interval(values: Iterable[float]) -> str:
     return f'{found.mean():.3f} ± {half:.3f}'
 
 
-def load(folder: pathlib.Path) -> dict[str, dict[int, dict[str, Any]]]:
-    """Returns the checked runs of two stages or more: learner -> seed -> result.
+def load(folder: pathlib.Path) -> Runs:
+    """Returns the checked runs of two stages or more.
 
     Raises:
       ValueError: a file is not a result, or two runs have the same learner and seed, or different
         settings.
     """
-    found: dict[str, dict[int, dict[str, Any]]] = {}
+    found: Runs = {}
     settings: set[Any] = set()
     for path in sorted(folder.glob('*.json')):
         result = sequences.read(path, complete=False)
@@ -67,7 +68,7 @@ def load(folder: pathlib.Path) -> dict[str, dict[int, dict[str, Any]]]:
     return dict(sorted(found.items(), key=lambda item: order.index(item[0])))
 
 
-def row(runs: dict[str, dict[int, dict[str, Any]]], name: str, stages: int) -> list[str]:
+def row(runs: Runs, name: str, stages: int) -> list[str]:
     """Returns the cells of a learner: number of runs, and metrics of the first stages."""
     values: dict[str, list[float]] = {column: [] for column in COLUMNS}
     for seed, result in runs[name].items():
@@ -82,16 +83,10 @@ def row(runs: dict[str, dict[int, dict[str, Any]]], name: str, stages: int) -> l
     return [f'`{name}`', str(len(runs[name])), *(interval(values[column]) for column in COLUMNS)]
 
 
-def transfers(result: dict[str, Any], reference: dict[str, Any], stages: int) -> list[float]:
+def transfers(result: Result, reference: Result, stages: int) -> list[float]:
     """Returns the learning transfer of every environment but the first."""
     curves = zip(result['curves'][1:stages], reference['curves'][1:stages], strict=True)
     return [sequences.learning_transfer(curve, other) for curve, other in curves]
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    head = list(head)
-    lines = [head, ['---', *['--:'] * (len(head) - 1)], *map(list, rows)]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
 def terrain(id_: str) -> str:
@@ -110,30 +105,22 @@ def section(folder: pathlib.Path) -> str:
         f'all {stages} stages' if stages == len(names)
         else f'the first {stages} of {len(names)} stages ({", ".join(names[:stages])})'
     )  # fmt: skip
-    after = [
-        [f'`{name}`', *(
-            interval(result['scores'][stages - 1][task] for result in seeds.values())
-            for task in range(stages)
-        )]
-        for name, seeds in runs.items()
-    ]  # fmt: skip
-    learnt = [
-        [f'`{name}`', *(
-            interval(result['scores'][task][task] for result in seeds.values())
-            for task in range(stages)
-        )]
-        for name, seeds in runs.items()
-    ]  # fmt: skip
-    faster = [
-        [f'`{name}`', *(
-            interval(
-                transfers(result, runs[REFERENCE][seed], stages)[task]
-                for seed, result in seeds.items() if seed in runs[REFERENCE]
-            )
-            for task in range(stages - 1)
-        )]
-        for name, seeds in runs.items() if name != REFERENCE and REFERENCE in runs
-    ]  # fmt: skip
+
+    def by_environment(values: Callable[[str, Result], list[float]], begin: int = 0) -> str:
+        """Returns a table of values (learner, result) -> of each environment from `begin` on."""
+        rows = []
+        for name, seeds in runs.items():
+            of_runs = [values(name, result) for result in seeds.values()]
+            if of_runs := [each for each in of_runs if each]:
+                rows.append([f'`{name}`', *map(interval, zip(*of_runs, strict=True))])
+        return table(['learner', *names[begin:stages]], rows)
+
+    def transfer(name: str, result: Result) -> list[float]:
+        reference = runs.get(REFERENCE, {}).get(result['seed'])
+        if name == REFERENCE or reference is None:
+            return []
+        return transfers(result, reference, stages)
+
     parts = [
         f'### `{first["sequence"]}`, {first["budget"]} samples per stage',
         f'Metrics of {part}, {first["episodes"]} episodes per test; mean over the runs and half '
@@ -141,27 +128,26 @@ def section(folder: pathlib.Path) -> str:
         table(['learner', 'runs', *(column.replace('_', ' ') for column in COLUMNS)],
               (row(runs, name, stages) for name in runs)),
         f'Scores after stage {stages}, by test environment:',
-        table(['learner', *names[:stages]], after),
+        by_environment(lambda _, result: result['scores'][stages - 1][:stages]),
         'Scores on each environment directly after its own stage:',
-        table(['learner', *names[:stages]], learnt),
+        by_environment(lambda _, result: [result['scores'][i][i] for i in range(stages)]),
     ]  # fmt: skip
-    if faster:
+    if REFERENCE in runs and len(runs) > 1:
         parts += [
             f'Learning transfer by environment, relative to `{REFERENCE}` with the same seed:',
-            table(['learner', *names[1:stages]], faster),
+            by_environment(transfer, 1),
         ]
-    name = folder.name
-    parts += [
-        f'![Learning curves: return in training, by stage](continual/{name}_curves.svg)',
-        f'![Scores on each environment after every stage](continual/{name}_scores.svg)',
-    ]
-    return '\n\n'.join(parts)
+    return '\n\n'.join([
+        *parts,
+        f'![Learning curves: return in training, by stage](continual/{folder.name}_curves.svg)',
+        f'![Scores on each environment after every stage](continual/{folder.name}_scores.svg)',
+    ])  # fmt: skip
 
 
-def curves_picture(runs: dict[str, dict[int, dict[str, Any]]], path: pathlib.Path) -> None:
+def curves_picture(runs: Runs, path: pathlib.Path) -> None:
     """Draws one panel per stage: return of training episodes over its samples."""
 
-    def panel(axes: Any, number: int, first: dict[str, Any]) -> None:
+    def panel(axes: Any, number: int, first: Result) -> None:
         for i, (name, seeds) in enumerate(runs.items()):
             found = [r['curves'][number] for r in seeds.values() if len(r['curves']) > number]
             if not found:
@@ -176,10 +162,10 @@ def curves_picture(runs: dict[str, dict[int, dict[str, Any]]], path: pathlib.Pat
     _picture(runs, path, panel, 'return in training')
 
 
-def scores_picture(runs: dict[str, dict[int, dict[str, Any]]], path: pathlib.Path) -> None:
+def scores_picture(runs: Runs, path: pathlib.Path) -> None:
     """Draws one panel per environment: score after every stage; its own stage is marked."""
 
-    def panel(axes: Any, number: int, first: dict[str, Any]) -> None:
+    def panel(axes: Any, number: int, first: Result) -> None:
         for i, (name, seeds) in enumerate(runs.items()):
             most = max(len(result['scores']) for result in seeds.values())
             rows = np.full((len(seeds), most + 1), np.nan)
@@ -194,39 +180,23 @@ def scores_picture(runs: dict[str, dict[int, dict[str, Any]]], path: pathlib.Pat
 
 
 def _picture(
-    runs: dict[str, dict[int, dict[str, Any]]],
-    path: pathlib.Path,
-    panel: Callable[[Any, int, dict[str, Any]], None],
-    label: str,
+    runs: Runs, path: pathlib.Path, panel: Callable[[Any, int, Result], None], label: str
 ) -> None:
-    import matplotlib
-    from matplotlib import pyplot
-
     first = next(iter(next(iter(runs.values())).values()))
-    # The same file for the same data.
-    with matplotlib.rc_context(
-        {'svg.hashsalt': 'continual', 'svg.fonttype': 'none', 'font.size': 8}
-    ):
-        figure, axes = pyplot.subplots(
-            1, len(first['ids']), figsize=(2.1 * len(first['ids']), 2.3), sharey=True,
-            layout='constrained',
-        )  # fmt: skip
-        for number, each in enumerate(axes):
+    count = len(first['ids'])
+    with picture(path, 1, count, figsize=(2.1 * count, 2.3), sharey=True) as (figure, axes):
+        for number, each in enumerate(axes[0]):
             panel(each, number, first)
-        axes[0].set_ylabel(label)
-        handles, names = axes[0].get_legend_handles_labels()
+        axes[0, 0].set_ylabel(label)
+        handles, names = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, names, fontsize=8, loc='outside lower center', ncols=len(names))
-        with files.replacing(path) as part:
-            figure.savefig(part, metadata={'Date': None})
-        pyplot.close(figure)
 
 
 def page(text: str) -> str:
     """Returns the page with the current results."""
     begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    sections = [section(folder) for folder in sorted(FOLDER.glob('*/'))]
-    found = list(filter(None, sections)) or [NONE]
-    return '\n\n'.join([text[:begin], *found, text[end:]])
+    sections = filter(None, map(section, sorted(FOLDER.glob('*/'))))
+    return '\n\n'.join([text[:begin], *sections, text[end:]])
 
 
 def main() -> None:

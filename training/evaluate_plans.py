@@ -16,19 +16,18 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import json
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from expert import expert
-from joint_expert import joint_expert
+import runs
+from expert import expert, joint_expert
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.tasks.task import CONTROL_TIMESTEP
-from trl_suite.util import errors, files, resources
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -137,8 +136,7 @@ def main() -> None:
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
-    path = resources.directory('trained') / 'plans.json'
-    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    found = runs.read('plans.json')
     for id_ in ids:
         for name in arguments.policies:
             make = maker(id_, name)
@@ -147,8 +145,7 @@ def main() -> None:
             result = run(id_, make, arguments.episodes, arguments.seed)
             found.setdefault(id_, {})[name] = result
             print(id_, name, {k: round(v, 3) for k, v in result.items()}, flush=True)
-            with files.replacing(path) as part:
-                part.write_text(json.dumps(found, indent=1) + '\n')
+            runs.write('plans.json', found)
 
 
 if __name__ == '__main__':

@@ -1,14 +1,14 @@
-"""An expert for footstep planning, with a map of the terrain and the velocities of moving boxes.
+"""Experts that policies imitate: for footstep plans, and for joint targets.
 
-While a policy observes coarse maps of the ground ahead, the expert uses privileged information:
-heights every 0.125 m on all sides, and velocities. It finds a short path to the goal that keeps a
-distance from all ground that is not level, and plans footsteps along it. In training a policy
-imitates the expert (learning by cheating, Chen et al. 2019, arXiv:1912.12294); the expert is not a
-baseline.
+While a policy observes coarse maps of the ground ahead, the experts use privileged information:
+heights every 0.125 m on all sides, and velocities of moving boxes. They find a short path to the goal that keeps
+a distance from all ground that is not level, and plan footsteps along it (learning by cheating, Chen
+et al. 2019, arXiv:1912.12294). They are no baselines.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -16,17 +16,20 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from trl_suite import policies
+from trl_suite.motion import quaternion
+from trl_suite.tasks.common.footstep_plan import PLAN_SIZE
 from trl_suite.tasks.navigation import scripted
+from trl_suite.tasks.navigation.direct import DirectNavigation
 from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
+from trl_suite.tasks.navigation.hierarchical_rules import CONTROLLER
+from trl_suite.tasks.navigation.plan_actions import STEP_LENGTH, plan_action_map
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
 from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
-REACH, FINE, COARSE = (
-    5.0,
-    0.125,
-    2,
-)  # half the map's side, m; height spacing, m; node spacing, heights
+REACH = 5.0  # m; half the map's side
+FINE, COARSE = 0.125, 2  # height spacing, m; node spacing, heights
 LEVEL = 0.12  # m; largest height difference to the goal of level ground
 DISTANCE = 0.85  # m; distance from obstacles below which a path costs more
 PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
@@ -37,6 +40,7 @@ AHEAD = 4.0  # step lengths; distance of the next point on a trail
 PAST, SHIFT = 3.0, 0.5
 PACE = 1.0  # m/s; assumed walking speed among moving boxes
 BEND, CLOSE = 0.35, 0.4  # rad, m; small steps for sharper turns or closer obstacles
+DRIBBLING = 'PD_Biped3D_HLC_Soccer-v0'
 LOOKS = 33  # points on a straight line at which the cost is sampled
 BEYOND = 1.5  # assumed cost per m outside the map
 
@@ -209,3 +213,73 @@ def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray
         )
     plan = planner(task, task.step_length, task.action_map)
     return lambda observation: plan(task.world.all_ids, task.stance)
+
+
+def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
+    """Makes an expert for tasks without hierarchy: planned footsteps, and the controller that tracks them.
+
+    At every switch of stance, footsteps are planned by the expert with a map, or with a ball by the
+    shipped policy for dribbling; the shipped footstep controller then gives the joint targets. A
+    policy without hierarchy that imitates it has one network and no plan: what is a fixed place in
+    the world for its teacher, it has to infer from pose, phase, map and goal. The expert has a state,
+    the current plans: it expects every observation of an episode in turn.
+
+    Raises:
+      ValueError: the task is not navigation without hierarchy.
+    """
+    task, blocks, n = environments.task, environments.blocks, environments.num_envs
+    if not isinstance(task, DirectNavigation):
+        raise ValueError(
+            f'the joint expert does not support the task {type(task).__name__}; expected: navigation '
+            'without hierarchy'
+        )
+    controller = policies.reference(CONTROLLER)
+    with contextlib.closing(VectorEnvironment(CONTROLLER, 1)) as tracking:
+        targets, observed = tracking.task.action_map, tracking.blocks
+    footsteps = plan_action_map(STEP_LENGTH)
+    dribble = policies.reference(DRIBBLING) if task.ball else None
+    plan = planner(task, STEP_LENGTH, footsteps, beyond=True)
+    everyone = np.arange(n)
+    stance = np.full(n, -1)
+    landing = np.zeros((n, 2, 3))  # of the swing foot, then of the stance foot
+    heading = np.zeros(n)
+
+    def plan_again(observation: np.ndarray, env_ids: np.ndarray) -> None:
+        found = task.figure.measurement
+        if dribble is None:
+            action = plan(env_ids, stance[env_ids])
+        else:
+            seen = [observation[env_ids, blocks[name]] for name in blocks if name != 'phase']
+            action = np.clip(dribble(np.concatenate(seen, axis=1)), -1, 1)
+        planned = footsteps.action_offset + footsteps.action_scale * action
+        root, yaw = found.root[env_ids], found.heading[env_ids]
+        for which in range(2):
+            place = root[:, :2] + quaternion.rotate_xy(planned[:, 2 * which : 2 * which + 2], yaw)
+            landing[env_ids, which, :2] = place
+            height = task.arena.height(place[:, :1], place[:, 1:], env_ids)
+            landing[env_ids, which, 2] = height[:, 0]
+        heading[env_ids] = yaw + planned[:, 4]
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        found = task.figure.measure()
+        before = stance.copy()
+        stance[:] = task.phase >= 0.5
+        begun = (stance != before) | (task.clock.steps == 0)
+        if begun.any():
+            plan_again(observation, np.flatnonzero(begun))
+        parts = {name: observation[:, part] for name, part in blocks.items()}
+        parts |= {'contact': found.contact, 'plan': np.zeros((n, PLAN_SIZE))}
+        for which in range(2):
+            foot = stance if which else 1 - stance
+            away = landing[:, which, :2] - found.feet[everyone, foot, :2]
+            slot = 6 * which + 3 * foot
+            ahead, left = quaternion.rotate_xy(away, -found.heading).T
+            parts['plan'][everyone, slot], parts['plan'][everyone, slot + 1] = ahead, left
+            parts['plan'][everyone, slot + 2] = landing[:, which, 2] - found.under
+        parts['plan'][:, -1] = wrap(heading - found.heading)
+        action = controller(np.concatenate([parts[name] for name in observed], axis=1))
+        angles = targets.action_offset + targets.action_scale * np.clip(action, -1, 1)
+        own = task.action_map
+        return np.clip((angles - own.action_offset) / own.action_scale, -1, 1)
+
+    return policy

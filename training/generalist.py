@@ -4,7 +4,7 @@
     python training/generalist.py dog2d raptor2d --runs runs/generalist
 
 The specialists are the shipped policies of the eight terrains. A new network imitates them in states
-that it visits itself, DAgger as in `plaid.py` (Ross et al. 2011, arXiv:1011.0686), and is then trained
+that it visits itself, DAgger as in `continual.py` (Ross et al. 2011, arXiv:1011.0686), and is then trained
 with PPO in the environments of all terrains at the same time. A third policy has the mean weights of both
 (Wortsman et al. 2022, arXiv:2203.05482). The policy has no information about the terrain but its
 observation.
@@ -19,24 +19,22 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
 import pathlib
-import platform
 import time
 from typing import Any
 
 import numpy as np
-import plaid
 import ppo
-import ppo_settings
+import runs
 import torch
 import tqdm
+from continual import distil
+from networks import mean_of, trimmed
+from settings import settings_for
 from several import Several
-from train_all import SEED, trimmed
+from train_all import SEED
 
 from trl_suite import evaluation, policies
-from trl_suite.util import files, resources
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -108,7 +106,7 @@ def train(
     """Returns the distilled and the trained policy, and the learning curve."""
     torch.set_num_threads(1)
     counts = [settings.each * (2 if ground in settings.twice else 1) for ground in GROUNDS]
-    own = ppo_settings.settings_for(
+    own = settings_for(
         ids[-2], **settings.ppo, cloning_epochs=settings.epochs, num_envs=sum(counts)
     )
     trainer = ppo.Trainer(ids[-2], seed, own, 1)
@@ -121,7 +119,7 @@ def train(
         VectorEnvironment(id_, count, 1, int(own_seed), autoreset='disabled')
         for id_, count, own_seed in zip(ids, counts, seeds, strict=True)
     ])  # fmt: skip
-    plaid.distil(trainer, environments, experts, settings.distilled, settings.rounds)
+    distil(trainer, environments, experts, settings.distilled, settings.rounds)
     distilled = trainer.exported()
     policies.save(distilled, folder / 'distilled.npz')
     trainer.enter(environments)
@@ -143,14 +141,11 @@ def train(
 
 def enter(ids: list[str], policy: policies.Policy, entry: dict[str, Any]) -> None:
     """Ships the policy of a character, with its results."""
-    folder = resources.directory('trained') / 'generalist'
-    folder.mkdir(parents=True, exist_ok=True)
-    policies.save(policy, folder / f'{policy.id}.npz')
-    files.write_json(entry, folder / f'{policy.id}.json')
-    path = folder / policies.SHARED
-    shared = json.loads(path.read_text()) if path.exists() else {}
-    shared |= {id_: {'policy': policy.id} for id_ in ids if id_ != policy.id}
-    files.write_json(dict(sorted(shared.items())), path)
+    runs.write(f'generalist/{policy.id}.json', entry)
+    policies.save(policy, runs.place(f'generalist/{policy.id}.npz'))
+    for id_ in ids:
+        if id_ != policy.id:
+            runs.enter(f'generalist/{policies.SHARED}', id_, {'policy': policy.id})
 
 
 def main() -> None:
@@ -171,14 +166,14 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         begin = time.monotonic()
         distilled, policy, curve = train(ids, arguments.seed, settings, folder)
-        averaged = ppo.mean_of([distilled, policy])
+        averaged = mean_of([distilled, policy])
         found = {'distilled': distilled, 'trained': policy, 'averaged': averaged}
         made = {kind: trimmed(each) for kind, each in found.items()}
         results = {kind: evaluated(ids, lambda _, p=p: p, EPISODES) for kind, p in made.items()}
         best = max(made, key=lambda kind: mean_score(results[kind]))
         entry = {
             'ids': ids, 'seed': arguments.seed, 'settings': dataclasses.asdict(settings),
-            'machine': f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}',
+            'machine': runs.machine(),
             'seconds': round(time.monotonic() - begin), 'curve': curve,
             'specialists': evaluated(ids, policies.reference, EPISODES), **results, 'shipped': best,
         }  # fmt: skip

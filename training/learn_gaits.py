@@ -37,19 +37,20 @@ import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import checkpoints
+import gait_bench
+import networks
 import numpy as np
-import ppo
-import ppo_settings
+import runs
 import torch
 import tqdm
-import tune_gait
+from settings import matching
+from several import Several
 from torch import nn
 
-from trl_suite import characters, evaluation, policies
+from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import errors, machine
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -173,7 +174,7 @@ _PARTS = *_NETWORKS, 'optimizer'
 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """The settings of an environment."""
-    return Settings(**{**ppo_settings.matching(id_, OVERRIDES.items()), **changes})
+    return Settings(**{**matching(id_, OVERRIDES.items()), **changes})
 
 
 class Network(nn.Module):
@@ -270,66 +271,6 @@ class Replay:
                 value[: len(self)] = state[name]
 
 
-class Simulations:
-    """Simulations of several environments of one character, with one numbering.
-
-    Attributes:
-      groups: the simulations of each environment.
-      group: number of the environment of each simulation, (n,) int.
-    """
-
-    def __init__(self, ids: Sequence[str], seeds: Sequence[int], threads: int) -> None:
-        if len(seeds) < len(ids):
-            raise ValueError(f'{len(seeds)} simulations for {len(ids)} environments')
-        parts = [part.tolist() for part in np.array_split(seeds, len(ids))]
-        self.groups = [
-            VectorEnvironment(id_, len(part), threads, part, autoreset='disabled', step_limit=None)
-            for id_, part in zip(ids, parts, strict=True)
-        ]
-        self.group = np.repeat(np.arange(len(ids)), list(map(len, parts)))
-        self.place = np.concatenate([np.arange(len(part)) for part in parts])
-        characters = [environments.spec.character for environments in self.groups]
-        if len(set(characters)) > 1:
-            raise ValueError(f'environments of different characters: {sorted(set(characters))}')
-
-    @property
-    def observation(self) -> np.ndarray:
-        """Observations of all simulations, (n, size)."""
-        return np.concatenate([environments.task.observation for environments in self.groups])
-
-    def reset(self, env_ids: Sequence[int] | None = None) -> None:
-        """Begins an episode in some simulations, or in all."""
-        for number, environments in enumerate(self.groups):
-            if env_ids is None:
-                environments.reset()
-            elif places := [self.place[i] for i in env_ids if self.group[i] == number]:
-                environments.reset(places)
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Runs a cycle; returns rewards, whether there was a fall, and distances (m), (n,) each."""
-        steps = [
-            environments.step(action[self.group == number])
-            for number, environments in enumerate(self.groups)
-        ]
-        values = ((step.reward, step.terminated, step.info['distance']) for step in steps)
-        reward, terminated, distance = map(np.concatenate, zip(*values, strict=True))
-        return reward, terminated, distance
-
-    def get_state(self, env_id: int | None = None) -> Any:
-        """Returns the state of a simulation, or of all."""
-        if env_id is None:
-            return [environments.get_state() for environments in self.groups]
-        return self.groups[self.group[env_id]].get_state([self.place[env_id]])
-
-    def set_state(self, state: Any, env_id: int | None = None) -> None:
-        """Restores the state of a simulation, or of all."""
-        if env_id is not None:
-            self.groups[self.group[env_id]].set_state(state, [self.place[env_id]])
-            return
-        for environments, each in zip(self.groups, state, strict=True):
-            environments.set_state(each)
-
-
 def initial_policy(start: str) -> policies.Policy:
     """Returns the shipped policy of an environment, or the policy in a file."""
     return (policies.reference if start in policies.available() else policies.load)(start)
@@ -339,7 +280,7 @@ def environments_of(id_: str, settings: Settings) -> list[str]:
     """Returns the ids of all environments of a run; its own comes first.
 
     Raises:
-      ValueError: a pattern matches no id, or an environment has no gait.
+      ValueError: a pattern matches no id, or an environment has no gait or another character.
     """
     ids = [id_]
     for pattern in settings.also:
@@ -350,6 +291,9 @@ def environments_of(id_: str, settings: Settings) -> list[str]:
     for other in ids:
         if catalogue.BY_ID[other].actuation != 'gait':
             raise ValueError(f'{other} has no gait; expected an environment FSM_...')
+    characters = sorted({catalogue.BY_ID[other].character for other in ids})
+    if len(characters) > 1:
+        raise ValueError(f'environments of different characters: {characters}')
     return ids
 
 
@@ -363,17 +307,20 @@ class Learner:
         self.random = np.random.default_rng(seed)
         seeds = self.random.integers(2**32, size=n).tolist()  # different from those of evaluations
         self.ids = environments_of(id_, s)
-        self.simulations = Simulations(self.ids, seeds, threads)
-        environments = self.environments = self.simulations.groups[0]
+        if n < len(self.ids):
+            raise ValueError(f'{n} simulations for {len(self.ids)} environments')
+        self.simulations = Several([
+            VectorEnvironment(
+                each, len(part), threads, part.tolist(), autoreset='disabled', step_limit=None
+            )
+            for each, part in zip(self.ids, np.array_split(seeds, len(self.ids)), strict=True)
+        ])  # fmt: skip
+        environments = self.environments = self.simulations.parts[0]
         # Simulations without retries, and without random actions after the first cycles.
-        self.greedy = np.concatenate(
-            [
-                np.arange(each.num_envs) < s.greedy * each.num_envs
-                for each in self.simulations.groups
-            ]
-        )
+        counts = [each.num_envs for each in self.simulations.parts]
+        self.greedy = np.concatenate([np.arange(count) < s.greedy * count for count in counts])
         parameters = environments.task.gait.parameters
-        further = [tune_gait.vector_of(parameters, name) for name in s.gaits]
+        further = [gait_bench.vector_of(parameters, name) for name in s.gaits]
         self.choices = parameters.action(np.array([*parameters.base_actions, *further]))
         if np.abs(self.choices).max() > 1 + CHOICE_ERROR:
             raise ValueError(f'gaits: {s.gaits}; expected sets within the action range')
@@ -490,7 +437,7 @@ class Learner:
         """Sets mean and standard deviation of the networks' inputs from the replay."""
         x = self.replay.before[: len(self.replay)].astype(np.float64)
         line = x[:, : self.line] - x[:, [self.origin]]
-        self.mean, self.std = x.mean(0), np.maximum(x.std(0), ppo.LEAST_STD)
+        self.mean, self.std = x.mean(0), np.maximum(x.std(0), networks.LEAST_STD)
         self.mean[: self.line], self.std[: self.line] = line.mean(), self.settings.relief / CLIP
 
     def act(self) -> Action:
@@ -553,21 +500,21 @@ class Learner:
         s, simulations = self.settings, self.simulations
         for i, past in enumerate(self.past):
             past.append(simulations.get_state(i))
-        reward, fell, distance = simulations.step(taken)
+        step = simulations.step(taken)
+        reward, fell, distance = step.reward, step.terminated, step.info['distance']
         self.samples += s.num_envs
-        after, fresh = simulations.observation, []
+        after, fresh = simulations.observation, np.zeros(s.num_envs, bool)
         counted = np.stack([distance - self.travelled, fell], 1)[self.greedy]
         np.add.at(self.tally, simulations.group[self.greedy], counted)
         self.travelled = np.where(fell, 0.0, distance)
         self.tried[1] += 1
         self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
         for i in np.flatnonzero(fell).tolist():
-            if self.go_back(i):
-                continue
-            fresh.append(i)
-            self.past[i].clear()
-            self.tried[:, i] = 0
-        if fresh:
+            if not self.go_back(i):
+                fresh[i] = True
+                self.past[i].clear()
+                self.tried[:, i] = 0
+        if fresh.any():
             simulations.reset(fresh)
         self.observation = simulations.observation
         return reward + s.alive * ~fell, fell, after
@@ -632,8 +579,7 @@ class Learner:
                 self.learn()
         self.seconds['simulation'] += middle - begin
         self.seconds['learning'] += time.process_time() - middle
-        every = s.renew_every
-        if every and self.samples // every > before // every:
+        if s.renew_every and runs.passed(before, self.samples, s.renew_every):
             self.finish()
 
     def finish(self) -> None:
@@ -672,45 +618,22 @@ class Learner:
         return policies.ensemble(list(map(self._policy, networks or self.members or [self.target])))
 
     def _policy(self, network: Network) -> policies.Policy:
-
-        def arrays(parts: nn.ModuleList, axes: tuple[int, ...]) -> dict[str, Any]:
-            return {
-                'weights': tuple(part.weight.permute(axes).numpy().copy() for part in parts),
-                'biases': tuple(part.bias.numpy().copy() for part in parts),
-            }
-
-        environments = self.environments
-        layers = arrays(nn.ModuleList([*network.hidden, network.last]), (1, 0))
+        layers = networks.arrays([*network.hidden, network.last], (1, 0))
         if network.actors is not None:
-            actors = arrays(nn.ModuleList([network.actors]), (1, 0))
+            actors = networks.arrays([network.actors], (1, 0))
             for name, axis in (('weights', 1), ('biases', 0)):
                 *hidden, last = layers[name]
                 layers[name] = (*hidden, np.concatenate([last, *actors[name]], axis))
         strides = *(stride for *_, stride in self.settings.convolutions), 1
+        convolution = policies.Convolution(
+            line=self.line, strides=strides, origin=self.origin,
+            **networks.arrays(network.filters, (2, 1, 0)),
+        )  # fmt: skip
         return policies.Policy(
-            id=environments.spec.id,
-            blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
-            actions=tuple(environments.action_map.names),
-            quantity=environments.action_map.quantity,
-            mean=self.mean,
-            std=self.std,
-            clip=CLIP,
-            columns=self.columns,
-            convolution=policies.Convolution(
-                line=self.line, strides=strides, origin=self.origin,
-                **arrays(network.filters, (2, 1, 0)),
-            ),
-            **layers,
-            activation='relu',
-            layer_norm=True,
-            log_std=np.full(len(environments.action_map), np.log(ppo.LEAST_STD)),
-            choices=self.choices,
-            info={
-                'seed': self.seed,
-                'samples': self.samples,
-                'character': characters.fingerprint(environments.task.character.spec),
-                **machine.made_with(),
-            },
+            **networks.described(self.environments, self.seed, self.samples), mean=self.mean,
+            std=self.std, clip=CLIP, columns=self.columns, convolution=convolution, **layers,
+            activation='relu', layer_norm=True, choices=self.choices,
+            log_std=np.full(self.choices.shape[1], np.log(networks.LEAST_STD)),
         )  # fmt: skip
 
     def evaluate(self) -> dict[str, Any]:
@@ -725,8 +648,8 @@ class Learner:
         point: dict[str, Any] = {}
         if s.evaluation_episodes:
             results = evaluation.evaluate_all(
-                [(each.spec, self.exported()) for each in self.simulations.groups],
-                s.evaluation_episodes, ppo.EVALUATION_SEED, self.threads,
+                [(each.spec, self.exported()) for each in self.simulations.parts],
+                s.evaluation_episodes, runs.EVALUATION_SEED, self.threads,
             )  # fmt: skip
             result = results[0]
             for name in ('normalized_return', 'completion_rate', 'distance', 'median_distance'):
@@ -747,7 +670,10 @@ class Learner:
         """Returns all that a checkpoint holds."""
         state = {name: getattr(self, name) for name in _STATE}
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
-        state |= {name: getattr(self, name).get_state() for name in ('replay', 'simulations')}
+        state |= {
+            'replay': self.replay.get_state(),
+            'simulations': self.simulations.get_state()['parts'],
+        }
         state['members'] = [each.state_dict() for each in self.members]
         state['past'] = list(map(list, self.past))
         state['chains'] = [
@@ -760,20 +686,20 @@ class Learner:
 
     def save(self, folder: pathlib.Path) -> None:
         """Writes checkpoint, curve and policy."""
-        checkpoints.save(self.get_state(), folder / 'checkpoint.pt')
+        runs.save(self.get_state(), folder / 'checkpoint.pt')
         self.write_curve(folder)
         policies.save(self.exported(), folder / 'last.npz')
 
     def write_curve(self, folder: pathlib.Path) -> None:
         """Writes the settings and the curve."""
-        checkpoints.write_curve(
+        runs.write_curve(
             folder, self.environments.spec.id, self.seed, self.settings, self.threads, self.curve,
             environments=self.ids,
         )  # fmt: skip
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        state = checkpoints.load_run(folder, self.settings, _CHANGEABLE)
+        state = runs.load_run(folder, self.settings, _CHANGEABLE)
         self.set_state(state)
         if any(state['settings'][name] != getattr(self.settings, name) for name in _FINAL):
             self.renewed = 0  # so that the final phase is repeated
@@ -796,8 +722,8 @@ class Learner:
         self.members = [copy.deepcopy(self.target) for _ in state['members']]
         for network, weights in zip(self.members, state['members'], strict=True):
             network.load_state_dict(weights)
-        for name in ('replay', 'simulations'):
-            getattr(self, name).set_state(state[name])
+        self.replay.set_state(state['replay'])
+        self.simulations.set_state({'parts': state['simulations']})
         self.random.bit_generator.state = state['random']
 
 
@@ -811,7 +737,7 @@ def train(
         differ.
       RuntimeError: another process trains in the folder.
     """
-    with checkpoints.only_run(folder):
+    with runs.only_run(folder):
         return _train(id_, seed, settings, folder, threads)
 
 
@@ -828,11 +754,11 @@ def _train(
             before = learner.samples
             learner.advance()
             bar.update(learner.samples - before)
-            if learner.samples // s.evaluate_every > before // s.evaluate_every:
+            if runs.passed(before, learner.samples, s.evaluate_every):
                 point = learner.evaluate()
                 far = point.get('distance', np.nan)
                 bar.set_postfix(distance=f'{far:.1f} m', loss=f'{point["loss"]:.4f}')
-            if learner.samples // s.write_every > before // s.write_every:
+            if runs.passed(before, learner.samples, s.write_every):
                 learner.save(folder)
     learner.save(folder)
     if learner.renewed < learner.samples:
@@ -853,7 +779,7 @@ def report(curve: list[dict[str, Any]], folder: pathlib.Path) -> None:
 
 def main() -> None:
     further = {'action': {'choices': ACTIONS}, 'members': {'type': int}}
-    id_, seed, changes, folder, threads = ppo.command_line(
+    id_, seed, changes, folder, threads = runs.command_line(
         __doc__.splitlines()[0], 'cycles', further
     )
     report(train(id_, seed, settings_for(id_, **changes), folder, threads), folder)

@@ -32,13 +32,13 @@ import pathlib
 import time
 from typing import Any
 
-import checkpoints
 import learn_gaits
 import numpy as np
 import ppo
-import ppo_settings
+import runs
 import torch
 import tqdm
+from settings import matching
 from torch import nn
 from torch.optim import swa_utils
 
@@ -136,7 +136,7 @@ _PARTS = 'policy', 'average', 'value', 'policy_optimizer', 'value_optimizer'
 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """The settings of an environment."""
-    own = ppo_settings.matching(id_, OVERRIDES.items())
+    own = matching(id_, OVERRIDES.items())
     return Settings(**{'first': learn_gaits.settings_for(id_), **own, **changes})
 
 
@@ -322,13 +322,9 @@ class Refiner:
                 if float(-growth.detach().mean()) > s.kl:
                     only_value = True  # in the rest of this update
                     continue
-                ratio = growth.exp()
-                gain = torch.minimum(
-                    ratio * b['advantage'],
-                    ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
-                )
+                gain = ppo.clipped_gain(growth.exp(), b['advantage'], s.clip)
                 self.policy_optimizer.zero_grad()
-                (-gain.mean()).backward()
+                (-gain).backward()
                 nn.utils.clip_grad_norm_(self.policy.parameters(), s.gradient_norm)
                 self.policy_optimizer.step()
         if changes and learner.updates >= s.value_first:
@@ -377,7 +373,7 @@ class Refiner:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from its checkpoint."""
-        state = checkpoints.load_run(folder, self.settings, _CHANGEABLE)
+        state = runs.load_run(folder, self.settings, _CHANGEABLE)
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
         self.learner.set_state(state['learner'])
@@ -391,7 +387,7 @@ class Refiner:
             *before,
             *({**point, 'samples': point['samples'] + done} for point in self.learner.curve),
         ]
-        checkpoints.write_curve(
+        runs.write_curve(
             folder, self.learner.environments.spec.id, self.learner.seed, self.settings, threads,
             curve, environments=self.learner.ids,
         )  # fmt: skip
@@ -425,7 +421,7 @@ def train(
         differ.
       RuntimeError: another process trains in the folder.
     """
-    with checkpoints.only_run(folder):
+    with runs.only_run(folder):
         torch.set_num_threads(1)
         simulated(id_, settings)  # before Q-learning
         initial, before = first_policy(id_, seed, settings, folder, threads)
@@ -439,17 +435,17 @@ def train(
                 refiner.advance()
                 bar.update(refiner.samples - begin)
                 ends = refiner.samples >= s.samples
-                if ends or refiner.samples // s.evaluate_every > begin // s.evaluate_every:
+                if ends or runs.passed(begin, refiner.samples, s.evaluate_every):
                     point = refiner.evaluate()
                     bar.set_postfix(distance=f'{point.get("distance", np.nan):.1f} m')
                     refiner.write(folder, before, threads)
-                if ends or refiner.samples // s.write_every > begin // s.write_every:
-                    checkpoints.save(refiner.get_state(), folder / 'checkpoint.pt')
+                if ends or runs.passed(begin, refiner.samples, s.write_every):
+                    runs.save(refiner.get_state(), folder / 'checkpoint.pt')
         return refiner.write(folder, before, threads)
 
 
 def main() -> None:
-    id_, seed, changes, folder, threads = ppo.command_line(
+    id_, seed, changes, folder, threads = runs.command_line(
         __doc__.splitlines()[0], 'cycles', {'start': {}, 'changes': {'choices': CHANGES}}
     )
     curve = train(id_, seed, settings_for(id_, **changes), folder, threads)

@@ -10,35 +10,29 @@ its mean distance is not below the interval of the default gait. Of several pref
 gait (`Policy.with_preference`) the best one is used, measured with another seed.
 
 Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
-environment in which it was trained; `preference`, if it is not 0; `evaluation`, its results; and `before`,
-the results of the shipped policy or the default gait that it replaces.
+environment in which it was trained; `preference`, if it is not 0; and `evaluation`, its results.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from typing import Any
 
-import ppo
+import runs
 import train_all
 
 from trl_suite import evaluation, policies
-from trl_suite.util import files, resources
 from trl_suite.util.program import begin_script
 
 
 def stored(id_: str, episodes: int) -> dict[str, Any] | None:
     """Returns the results of the shipped policy, if it was evaluated in as many episodes."""
-    trained = resources.directory('trained')
-    shared = trained / policies.SHARED
-    entries = json.loads(shared.read_text()) if shared.exists() else {}
-    own = trained / f'{id_}.json'
-    if id_ in entries:
-        found = entries[id_]['evaluation']
-    elif own.exists():
-        found = train_all.shipped(json.loads(own.read_text()))['evaluation']
+    shared, own = runs.read(policies.SHARED), runs.read(f'{id_}.json')
+    if id_ in shared:
+        found = shared[id_]['evaluation']
+    elif own:
+        found = train_all.shipped(own)['evaluation']
     else:
         return None
     asked = {'episodes': episodes, 'seed': train_all.SEED}
@@ -54,7 +48,7 @@ def preferring(
         return next(iter(found.items()))
 
     def distance(candidate: tuple[float, policies.Policy]) -> float:
-        result = evaluation.evaluate(id_, candidate[1], episodes, ppo.EVALUATION_SEED, threads)
+        result = evaluation.evaluate(id_, candidate[1], episodes, runs.EVALUATION_SEED, threads)
         print(f'{id_}: preference {candidate[0]:g}: {result["distance"]:.1f} m', flush=True)
         return result['distance']
 
@@ -65,7 +59,7 @@ def remove_unused(shared: dict[str, Any]) -> None:
     """Removes the policies of environments that use another one, unless others use theirs."""
     for id_ in shared.keys() - {entry['policy'] for entry in shared.values()}:
         for suffix in ('npz', 'json'):
-            (resources.directory('trained') / f'{id_}.{suffix}').unlink(missing_ok=True)
+            runs.place(f'{id_}.{suffix}').unlink(missing_ok=True)
 
 
 def main() -> None:
@@ -78,7 +72,6 @@ def main() -> None:
     parser.add_argument('--preferences', type=float, nargs='+', default=[0.0])
     parser.add_argument('--threads', type=int, default=1, help='0: all cores')
     arguments = parser.parse_args()
-    path = resources.directory('trained') / policies.SHARED
     for id_ in arguments.ids:
         options = arguments.episodes, train_all.SEED, arguments.threads
         before, has_policy = stored(id_, arguments.episodes), id_ in policies.available()
@@ -99,12 +92,9 @@ def main() -> None:
         low, high = before['distance_interval']
         if found['distance'] <= (high if has_policy else low):
             continue
-        shared = json.loads(path.read_text()) if path.exists() else {}
         entry = {'policy': arguments.policy, **({'preference': preference} if preference else {})}
-        shared[id_] = {**entry, 'evaluation': found, 'before': before}
-        with files.replacing(path) as part:
-            part.write_text(json.dumps(dict(sorted(shared.items()))) + '\n')
-        remove_unused(shared)
+        runs.enter(policies.SHARED, id_, {**entry, 'evaluation': found})
+        remove_unused(runs.read(policies.SHARED))
 
 
 if __name__ == '__main__':

@@ -6,10 +6,9 @@
     python training/train_all.py --filter FSM_Goat2D_Terrain_Cliffs-v0
     python training/train_all.py --ray                 # on all cores, or on those of a cluster
 
-Each run is `training/ppo.py` on one thread, or for gait environments (FSM_...)
-`training/learn_gaits.py` or `training/refine_gaits.py`. A run that uses the policy of another environment, as initial policy or as footstep controller, starts after the runs
-of that environment.
-Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
+Each run is `ppo.py` on one thread, or for gait environments (FSM_...) `learn_gaits.py` or
+`refine_gaits.py`. A run that uses the policy of another environment, as initial policy or as footstep
+controller, starts after the runs of that environment. Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
 into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
 becomes `trained/ID.npz`. Runs that have been entered with the same settings are not repeated.
 The environment variable TRL_SUITE_TRAINED selects another folder than `trained`. By default
@@ -36,44 +35,35 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import checkpoints
 import learn_gaits
-import numpy as np
 import ppo
 import refine_gaits
+import runs
 import tqdm
+from networks import trimmed
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.registry.task_types import TASK_TYPES
-from trl_suite.util import errors, files, resources
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 
 EPISODES, SEED = 50, 0  # of the published evaluation
+OTHER_SEED = 1  # of its repetition in other episodes, if the best of several seeds is shipped
 GAIT_EPISODES = 200  # the standard deviation of the distance before a fall is as large as its mean
 SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
 ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # a row of the table of runs
 MEMORY = 1.5e9  # bytes of memory that Ray reserves for a run
 GAITS = (  # gait environments that are trained by default
-    'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
-    'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
-    'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
-    'FSM_Dog2D_Terrain_Stairs_Rugged-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
-)  # fmt: skip
-
-# Gait environments whose policies refine_gaits.py improves: of these, or of the environment from
-# which they start.
-REFINED = (
-    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
-    'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
-    'FSM_Hopper2D_Terrain_Mixed-v0',
+    *(f'FSM_Dog2D_Terrain_{name}-v0' for name in ('Mixed', 'Cliffs', 'Slopes_Mixed', 'Stairs_Rugged')),
+    *(f'FSM_Raptor2D_Terrain_{name}-v0' for name in ('Mixed', 'Slopes_Mixed')),
+    *(f'FSM_Goat2D_Terrain_{name}-v0' for name in ('Cliffs', 'Variable_Steps')),
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
 )  # fmt: skip
 
 
@@ -106,7 +96,7 @@ def program(id_: str) -> ModuleType:
     """Returns the program that trains an environment."""
     if catalogue.BY_ID[id_].actuation != 'gait':
         return ppo
-    return refine_gaits if id_ in REFINED else learn_gaits
+    return refine_gaits if id_ in refine_gaits.OVERRIDES else learn_gaits
 
 
 def start_of(id_: str) -> str | None:
@@ -130,19 +120,16 @@ def depth(id_: str) -> int:
 
 def entries(id_: str) -> list[dict[str, Any]]:
     """Returns the runs that have been entered for an environment."""
-    path = resources.directory('trained') / f'{id_}.json'
-    if not path.exists():
-        return []
-    runs = json.loads(path.read_text())['runs']
+    found = runs.read(f'{id_}.json').get('runs', [])
     default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
-    for run in runs:  # new settings get their defaults, removed ones are dropped
+    for run in found:  # new settings get their defaults, removed ones are dropped
         run['settings'] = own = {
             name: run['settings'].get(name, value) for name, value in default.items()
         }
         if 'first' in default:
             first = default['first'].items()
             own['first'] = {name: own['first'].get(name, value) for name, value in first}
-    return runs
+    return found
 
 
 def changes(samples: float | None) -> dict[str, float]:
@@ -172,14 +159,14 @@ class Run(NamedTuple):
     seconds: float
 
 
-def train(id_: str, seed: int, runs: pathlib.Path, samples: float | None, machine: str) -> Run:
+def train(id_: str, seed: int, output: pathlib.Path, samples: float | None, machine: str) -> Run:
     """Trains in a separate process, and evaluates."""
     begin = time.monotonic()
     script = pathlib.Path(program(id_).__file__ or '')
-    command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={runs}']
+    command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={output}']
     if samples is not None:
         command.append(f'--samples={samples}')
-    folder = runs / id_ / f'seed_{seed}'
+    folder = output / id_ / f'seed_{seed}'
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / 'log.txt', 'a') as log:
         subprocess.run(command, check=True, stdout=log, stderr=log)
@@ -225,37 +212,13 @@ def given(id_: str) -> dict[str, bytes]:
     """Returns the files of `trained` that a run reads, for `train_here`."""
     shipped = policies.available()
     used = {other: policies.trained_for(other) for other in (*needed(id_), id_) if other in shipped}
-    trained = resources.directory('trained')
-    found = {f'{other}.npz': (trained / f'{other}.npz').read_bytes() for other in used.values()}
+    found = {f'{other}.npz': runs.place(f'{other}.npz').read_bytes() for other in used.values()}
     shared = {
         id_: {'policy': other, 'preference': policies.preference_for(id_)}
         for id_, other in used.items()
         if id_ != other
     }
     return {**found, policies.SHARED: json.dumps(shared).encode()}
-
-
-def trimmed(policy: policies.Policy) -> policies.Policy:
-    """Returns the policy for a small file.
-
-    Weights are rounded to half precision, and inputs that are always 0 are removed, for example the
-    footstep of the stance foot.
-    """
-    if policy.convolution is not None:  # the inputs of a convolution cannot be removed
-        line = policy.convolution
-        line = dataclasses.replace(line, weights=_rounded(line.weights))
-        return dataclasses.replace(policy, convolution=line, weights=_rounded(policy.weights))
-    kept = (policy.mean != 0) | (policy.std > ppo.LEAST_STD)
-    columns = np.arange(len(kept)) if policy.columns is None else policy.columns
-    weights = (policy.weights[0][kept], *policy.weights[1:])
-    return dataclasses.replace(
-        policy, columns=columns[kept], mean=policy.mean[kept], std=policy.std[kept],
-        weights=_rounded(weights),
-    )  # fmt: skip
-
-
-def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
-    return tuple(w.astype(np.float16).astype(w.dtype) for w in weights)
 
 
 def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
@@ -269,29 +232,39 @@ def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     episodes = GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
     found = evaluation.evaluate(id_, policy, episodes, SEED, num_threads=1)
-    machine = machine or f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
-    entry = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
+    entry = {
+        **curve,
+        'machine': machine or runs.machine(),
+        'shipped_at': policy.info['samples'],
+        'evaluation': found,
+    }
     return Run(entry, policy, platform.node(), time.monotonic() - begin)
 
 
 def enter(id_: str, seed: int, run: Run) -> None:
-    """Enters a run into the file of its environment."""
+    """Enters a run into the file of its environment, and ships its policy if it is the best.
+
+    Of several seeds the best one is chosen in the episodes of `evaluation`; a mean over seeds is not
+    affected by the choice, but the evaluation of the chosen one is, so it is evaluated once more in
+    episodes that had no part in it.
+    """
     own = run.entry
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == own['settings']]
     every = sorted([own, *others], key=lambda r: r['seed'])
     best = max(every, key=lambda r: r['evaluation']['return'])
-    trained = resources.directory('trained')
-    trained.mkdir(parents=True, exist_ok=True)
     if best is own:
-        policies.save(run.policy, trained / f'{id_}.npz')
-    with files.replacing(trained / f'{id_}.json') as part:
-        part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
-    shared = trained / policies.SHARED
-    used = json.loads(shared.read_text()) if shared.exists() else {}
+        runs.place('').mkdir(parents=True, exist_ok=True)
+        policies.save(run.policy, runs.place(f'{id_}.npz'))
+    entry = {'id': id_, 'shipped': best['seed'], 'runs': every}
+    if len(every) > 1:
+        entry['shipped_again'] = evaluation.evaluate(
+            id_, policies.load(runs.place(f'{id_}.npz')), EPISODES, OTHER_SEED, num_threads=1
+        )
+    runs.write(f'{id_}.json', entry)
+    used = runs.read(policies.SHARED)
     if id_ in used and used[id_]['evaluation']['return'] < best['evaluation']['return']:
         del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
-        with files.replacing(shared) as part:
-            part.write_text(json.dumps(used) + '\n')
+        runs.write(policies.SHARED, used)
 
 
 def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callable[[str, int], Run]:
@@ -321,12 +294,12 @@ def in_processes(arguments: argparse.Namespace) -> Callable[[str, int], Run]:
     """Returns a function that trains in a process of this machine."""
 
     def work(id_: str, seed: int) -> Run:
-        runs = pathlib.Path(arguments.runs)
-        folder = runs / id_ / f'seed_{seed}'
+        output = pathlib.Path(arguments.runs)
+        folder = output / id_ / f'seed_{seed}'
         if arguments.overwrite and folder.exists():
-            with checkpoints.only_run(folder):  # not while another process trains there
+            with runs.only_run(folder):  # not while another process trains there
                 shutil.rmtree(folder)
-        return train(id_, seed, runs, arguments.samples, arguments.machine)
+        return train(id_, seed, output, arguments.samples, arguments.machine)
 
     return work
 

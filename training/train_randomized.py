@@ -4,7 +4,7 @@
     python training/train_randomized.py Torque_Dog2D_LLC_Imitate_Flat-v0 --overwrite
     python training/train_randomized.py --page docs/reports/robustness.md  # also writes its table
 
-Each run is `training/ppo.py` on one thread, with the settings `RANDOMIZED` of `ppo_settings.py`,
+Each run is `training/ppo.py` on one thread, with the settings `RANDOMIZED` of `settings.py`,
 starting from the shipped policy. Interrupted runs continue from their checkpoints in RUNS. The policy
 with the best score of the learning curve, whose evaluations have the same disturbances, becomes
 `trained/randomized/ID.npz`. It and the shipped policy are then evaluated without disturbances
@@ -17,19 +17,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import pathlib
-import platform
 import shutil
 from typing import Any
 
 import ppo
-import ppo_settings
+import runs
 import tqdm
-from train_all import SEED, trimmed
+from networks import trimmed
+from settings import RANDOMIZED, randomized_settings_for
+from train_all import SEED
 
 from trl_suite import evaluation, policies
-from trl_suite.util import errors, files, resources
+from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
@@ -41,33 +41,26 @@ RESULTS = ('return', 'return_interval', 'completion_rate', 'distance', 'episodes
 _MARK, _END = '<!-- randomized, written by training/train_randomized.py -->', '<!-- /randomized -->'
 
 
-def place(id_: str) -> pathlib.Path:
-    """Returns the path of the results of an environment; the policy is beside it, as .npz."""
-    return resources.directory('trained') / 'randomized' / f'{id_}.json'
+def place(id_: str) -> str:
+    """Returns the name of the results of an environment; the policy is beside it, as .npz."""
+    return f'randomized/{id_}.json'
 
 
-def write(entry: dict[str, Any]) -> None:
-    """Writes the results of an environment."""
-    with files.replacing(place(entry['id'])) as part:
-        part.write_text(json.dumps(entry) + '\n')
-
-
-def train(id_: str, seed: int, runs: pathlib.Path) -> None:
+def train(id_: str, seed: int, output: pathlib.Path) -> None:
     """Trains, and writes the policy with settings and curve."""
-    folder = runs / id_ / f'seed_{seed}'
-    settings = ppo_settings.randomized_settings_for(id_)
-    ppo.train(id_, seed, settings, folder, threads=1)
+    folder = output / id_ / f'seed_{seed}'
+    ppo.train(id_, seed, randomized_settings_for(id_), folder, threads=1)
     policy = trimmed(policies.load(folder / 'policy.npz'))
-    place(id_).parent.mkdir(parents=True, exist_ok=True)
-    policies.save(policy, place(id_).with_suffix('.npz'))
-    machine = f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
     curve = json.loads((folder / 'curve.json').read_text())
-    write({**curve, 'machine': machine, 'shipped_at': policy.info['samples']})
+    runs.write(
+        place(id_), {**curve, 'machine': runs.machine(), 'shipped_at': policy.info['samples']}
+    )
+    policies.save(policy, runs.place(place(id_)).with_suffix('.npz'))
 
 
 def measure(id_: str) -> dict[str, Any]:
     """Evaluates where results are missing, and writes them; returns all results of an environment."""
-    entry = json.loads(place(id_).read_text())
+    entry = runs.read(place(id_))
     for name, variant in (('evaluations', 'randomized'), ('before', '')):
         found = entry.setdefault(name, {})
         for condition, options in CONDITIONS.items():
@@ -75,7 +68,7 @@ def measure(id_: str) -> dict[str, Any]:
                 policy = policies.reference(id_, variant)
                 result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
                 found[condition] = {key: result[key] for key in RESULTS}
-                write(entry)
+                runs.write(place(id_), entry)
     return entry
 
 
@@ -119,20 +112,20 @@ def table(entries: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('ids', nargs='*', metavar='ID', default=list(ppo_settings.RANDOMIZED))
+    parser.add_argument('ids', nargs='*', metavar='ID', default=list(RANDOMIZED))
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/randomized'))
     parser.add_argument('--overwrite', action='store_true', help='repeat runs that are entered')
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
     for id_ in arguments.ids:
-        if id_ not in ppo_settings.RANDOMIZED:
-            raise ValueError(errors.unknown('environment', id_, ppo_settings.RANDOMIZED))
+        if id_ not in RANDOMIZED:
+            raise ValueError(errors.unknown('environment', id_, RANDOMIZED))
     entries = []
     for id_ in tqdm.tqdm(arguments.ids, unit='run'):
         if arguments.overwrite:
             shutil.rmtree(arguments.runs / id_ / f'seed_{arguments.seed}', ignore_errors=True)
-        if arguments.overwrite or not place(id_).exists():
+        if arguments.overwrite or not runs.place(place(id_)).exists():
             train(id_, arguments.seed, arguments.runs)
         entries.append(measure(id_))
     text = table(entries)

@@ -13,12 +13,12 @@ import pathlib
 import tempfile
 
 import ppo
-import ppo_settings
 import ray
 import storage
 from ray import tune
 from ray.tune import schedulers
 from ray.tune.search.basic_variant import BasicVariantGenerator
+from settings import settings_for
 
 from trl_suite.adapters.ray import connect
 from trl_suite.util.program import begin_script
@@ -41,9 +41,7 @@ def trial(values, id_, samples, seed, runs):
             super().evaluate(folder, divergence)
             tune.report({name: self.curve[-1][name] for name in ('samples', SCORE)})
 
-    settings = ppo_settings.settings_for(
-        id_, samples=samples, evaluate_every=samples / POINTS, **values
-    )
+    settings = settings_for(id_, samples=samples, evaluate_every=samples / POINTS, **values)
     ppo.Trainer = Trainer  # this process is for one trial
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder, 'run')

@@ -218,10 +218,10 @@ class LearnTest(parameterized.TestCase):
         settings = dataclasses.replace(TINY, num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
         learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
         self.assertEqual(learner.ids, [HOPPER, WALLS, HOPPER])
-        self.assertEqual([group.num_envs for group in learner.simulations.groups], [2, 2, 1])
+        self.assertEqual([group.num_envs for group in learner.simulations.parts], [2, 2, 1])
         np.testing.assert_array_equal(learner.simulations.group, [0, 0, 1, 1, 2])
         np.testing.assert_array_equal(learner.greedy, [True, False, True, False, True])
-        seeds = [seed for group in learner.simulations.groups for seed in group.seeds.tolist()]
+        seeds = [seed for group in learner.simulations.parts for seed in group.seeds.tolist()]
         self.assertLen(set(seeds), 5)
         # Simulation 3 is the second of the walls.
         lone = VectorEnvironment(WALLS, 1, 1, seeds[3:4], autoreset='disabled')
@@ -245,7 +245,8 @@ class LearnTest(parameterized.TestCase):
         learner.simulations.step = lambda action: steps.append(step(action)) or steps[-1]
         for _ in range(30):
             learner.collect()
-        _, fell, distance = map(np.array, zip(*steps, strict=True))
+        fell = np.array([each.terminated for each in steps])
+        distance = np.array([each.info['distance'] for each in steps])
         for number, env_id in enumerate((0, 2)):  # these are greedy; the others are set back
             ends = distance[:, env_id][fell[:, env_id]]
             rest = 0.0 if fell[-1, env_id] else distance[-1, env_id]

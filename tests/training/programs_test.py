@@ -11,291 +11,157 @@ import tempfile
 from types import SimpleNamespace
 from unittest import mock
 
-import checkpoints
-import compare_actions
-import compare_hierarchy
-import compare_transfer
+import compare
 import evaluate_footsteps
 import evaluate_plans
+import evaluate_references
 import expert
 import generalist
-import joint_expert
+import networks
 import numpy as np
 import ppo
-import ppo_settings
+import runs
+import settings
 import share_gaits
 import train_all
 import train_randomized
-import tune_base_actions
-import tune_gait
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
-from trl_suite import characters, controllers, evaluation, policies
+from trl_suite import characters, evaluation, policies
 from trl_suite.registry import catalogue
-from trl_suite.util import files, resources
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 
-class CompareActionsTest(FolderTest):
-    def run_program(self, *arguments):
+class CompareTest(FolderTest):
+    def run_program(self, name, job, *arguments):
+        """Returns the cells and seeds that are trained, and the output."""
         trained = []
 
-        def train(id_, action, seed, cycles, runs):
-            trained.append((action, seed))
-            curve = [[8, 50.0], [16, 60.0 + seed]]
-            return {'distance': 100.0 * seed + len(action), 'speed': 3.0, 'curve': curve}
+        def counted(cell, seed, samples, folder):
+            trained.append((cell, seed))
+            return job(cell, seed, samples)
 
-        path = self.folder / 'found.json'
-        argv = ['compare_actions.py', '--json', str(path), *arguments]
+        compared = compare.COMPARISONS[name]._replace(job=counted)
+        argv = ['compare.py', name, '--json', str(self.folder / 'found.json'), *arguments]
         with (
-            mock.patch.object(compare_actions, 'train', train),
+            mock.patch.dict(compare.COMPARISONS, {name: compared}),
             mock.patch.object(sys, 'argv', argv),
             contextlib.redirect_stdout(io.StringIO()) as out,
             contextlib.redirect_stderr(io.StringIO()),
         ):
-            compare_actions.main()
+            compare.main()
         return trained, out.getvalue()
 
-    def test_finished_runs_are_kept_and_shown(self):
-        first, out = self.run_program()
-        self.assertEqual(
-            first, [(action, 1) for action in ('discrete', 'continuous', 'both', 'ppo')]
-        )
-        self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
-        second, out = self.run_program('--seeds', '1', '2')
-        self.assertEqual(second, [(action, 2) for action, _ in first])
-        self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
-        with self.assertRaisesRegex(
-            ValueError, 'cycles is 32768.*, not 100.*; give another --json'
-        ):
-            self.run_program('--cycles', '100')
-
-    def test_learning_curves_are_drawn(self):
+    def drawn(self, name, job, *arguments):
+        """Returns the axes of the picture."""
         from matplotlib import pyplot
 
         picture = self.folder / 'curves.png'
         with mock.patch.object(pyplot, 'close'):
-            self.run_program('--seeds', '1', '2', '--picture', str(picture))
-        axis = pyplot.gca()
+            self.run_program(name, job, *arguments, '--picture', str(picture))
+        axes = pyplot.gcf().axes
         pyplot.close('all')
         self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
-        drawn = [line.get_xydata().tolist() for line in axis.get_lines()]
-        for seed in (1, 2):
-            self.assertIn([[0.008, 50], [0.016, 60 + seed]], drawn)
-        self.assertIn([[32.768, 208]], drawn)  # discrete, seed 2
+        return axes
+
+    @staticmethod
+    def action(cell, seed, cycles):
+        curve = [[8, 50.0], [16, 60.0 + seed]]
+        return {'distance': 100.0 * seed + len(cell), 'speed': 3.0, 'curve': curve}
+
+    @staticmethod
+    def hierarchy(cell, seed, control_steps):
+        kind = cell.endswith('without')
+        last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
+        first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
+        points = enumerate((first, last), start=1)
+        return [{'control_steps': control_steps * i / 2, **each} for i, each in points]
+
+    def test_finished_runs_are_kept_and_shown(self):
+        first, out = self.run_program('actions', self.action)
+        self.assertEqual(first, [(each, 1) for each in ('discrete', 'continuous', 'both', 'ppo')])
+        self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
+        second, out = self.run_program('actions', self.action, '--seeds', '1', '2')
+        self.assertEqual(second, [(action, 2) for action, _ in first])
+        self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
+        message = 'samples is 32768.*, not 100.*; give another --json'
+        with self.assertRaisesRegex(ValueError, message):
+            self.run_program('actions', self.action, '--samples', '100')
+
+    def test_tables(self):
+        trained, out = self.run_program('hierarchy', self.hierarchy, '--seeds', '1', '2')
+        self.assertLen(trained, 8)
+        self.assertIn(
+            'median distance along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out
+        )
+        self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
+        (self.folder / 'found.json').unlink()
+        trained, out = self.run_program(
+            'limits', lambda cell, seed, _: {'normalized_return': 0.1 * len(cell), 'curve': []}
+        )
+        self.assertLen(trained, 11)  # muscles have no realistic limits but their strength
+        self.assertIn('| ideal | 1.40 | 1.20 | 1.40 | 1.20 |', out)
+        self.assertIn('| realistic | 1.80 | 1.60 | 1.80 | 1.20 |', out)
+
+    def test_learning_curves_are_drawn(self):
+        (axis,) = self.drawn('actions', self.action, '--seeds', '1', '2')
+        lines = [line.get_xydata().tolist() for line in axis.get_lines()]
+        self.assertIn([[0.008, 50], [0.016, 61], [0.016, 108]], lines)  # its final policy last
+        self.assertIn([[0.008, 50], [0.016, 62], [0.016, 208]], lines)
         self.assertLen(axis.get_legend().get_texts(), 4)
+        (self.folder / 'found.json').unlink()
+        trail, soccer = self.drawn('hierarchy', self.hierarchy, '--seeds', '1', '2')
+        lines = [line.get_xydata().tolist() for line in trail.get_lines()]
+        self.assertIn([[0.6, 1.0], [1.2, 20.0]], lines)  # with hierarchy, seed 2
+        self.assertLen(soccer.get_lines(), 4)
 
     @parameterized.parameters(
-        (compare_actions.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
-        (compare_actions.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
+        (compare.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
+        (compare.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
     )
     def test_a_run_has_the_settings_of_its_action(self, trainer, action, expected):
-        asked = []
+        asked, result = (
+            [],
+            {'distance': 3.0, 'distance_interval': [], 'median_distance': 2, 'speed': 1},
+        )
 
-        def train(id_, seed, settings, folder, threads):
-            asked.append((settings, folder))
+        def train(id_, seed, own, folder, threads):
+            asked.append(own)
             folder.mkdir(parents=True)
             policies.save(policies.reference(id_), folder / 'policy.npz')
             return [{'samples': 8, 'distance': 3.0}]
 
         with (
-            mock.patch.object(compare_actions, 'EPISODES', 1),
+            mock.patch.object(evaluation, 'evaluate', lambda *_: result),
             mock.patch.object(trainer, 'train', train),
         ):
-            found = compare_actions.train(
-                'FSM_Hopper2D_Terrain_Gaps-v0', action, 3, 64, self.folder
-            )
-        ((settings, _),) = asked
+            found = compare.train_actions(action, 3, 64, self.folder / 'run')
         expected = {**expected, 'samples': 64, 'evaluate_every': 16}
-        self.assertEqual({name: getattr(settings, name) for name in expected}, expected)
-        self.assertEqual(found['curve'], [[8, 3.0]])
-        self.assertGreater(found['distance'], 2.0)
+        self.assertEqual({name: getattr(asked[0], name) for name in expected}, expected)
+        self.assertEqual((found['curve'], found['distance']), ([[8, 3.0]], 3.0))
 
-
-class CompareHierarchyTest(FolderTest):
-    def run_program(self, *arguments):
-        trained = []
-
-        def job(task, kind, seed, control_steps, runs):
-            trained.append((task, kind, seed))
-            last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
-            first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
-            return [
-                {'control_steps': control_steps * (i + 1) / 2, **each}
-                for i, each in enumerate((first, last))
-            ]
-
-        path = self.folder / 'found.json'
-        argv = ['compare_hierarchy.py', '--json', str(path), *arguments]
-        with (
-            mock.patch.object(compare_hierarchy, 'job', job),
-            mock.patch.object(sys, 'argv', argv),
-            contextlib.redirect_stdout(io.StringIO()) as out,
-            contextlib.redirect_stderr(io.StringIO()),
-        ):
-            compare_hierarchy.main()
-        return trained, out.getvalue()
-
-    def test_finished_runs_are_kept_and_shown(self):
-        first, _ = self.run_program('--seeds', '1', '--tasks', 'trail')
-        self.assertEqual(first, [('trail', 0, 1), ('trail', 1, 1)])
-        second, out = self.run_program('--seeds', '1', '2')
-        self.assertNotIn(('trail', 0, 1), second)
-        self.assertLen(second, 6)
-        self.assertIn(
-            'median distance along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out
-        )
-        self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
-        with self.assertRaisesRegex(
-            ValueError, 'control_steps is 1200000.0, not .*; give another --json'
-        ):
-            self.run_program('--control-steps', '100')
-
-    def test_curves_are_drawn(self):
-        from matplotlib import pyplot
-
-        picture = self.folder / 'curves.png'
-        with mock.patch.object(pyplot, 'close'):
-            self.run_program('--seeds', '1', '2', '--picture', str(picture))
-        trail, soccer = pyplot.gcf().axes
-        pyplot.close('all')
-        self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
-        drawn = [line.get_xydata().tolist() for line in trail.get_lines()]
-        self.assertIn([[0.6, 1.0], [1.2, 20.0]], drawn)  # with hierarchy, seed 2
-        self.assertLen(soccer.get_lines(), 4)
-        self.assertEqual(
-            [text.get_text() for text in trail.get_legend().get_texts()],
-            ['with hierarchy', 'without'],
-        )
-
-    @parameterized.parameters((0, 15), (1, 1))
+    @parameterized.parameters(('with hierarchy', 15), ('without', 1))
     def test_both_kinds_have_the_same_number_of_control_steps(self, kind, each):
         """A plan of footsteps lasts 15 control steps of 1/30 s."""
-        asked = []
+        asked, original = [], settings.settings_for
 
         def run(id_, make, episodes, seed):
             asked.append(make(None).id)
             return {'trail': 1.0}
 
         def shorter(id_, **changes):
-            tiny = {'num_envs': 2, 'horizon': 4, 'minibatch': 8}
-            return ppo_settings.settings_for(id_, **{**changes, **tiny})
+            return original(id_, **{**changes, 'num_envs': 2, 'horizon': 4, 'minibatch': 8})
 
-        module = mock.Mock(settings_for=shorter)
         with (
-            mock.patch.object(compare_hierarchy.evaluate_plans, 'run', run),
-            mock.patch.object(compare_hierarchy, 'ppo_settings', module),
+            mock.patch.object(evaluate_plans, 'run', run),
+            mock.patch.object(settings, 'settings_for', shorter),
         ):
-            found = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
-            with mock.patch.object(compare_hierarchy.ppo, 'Trainer') as trainer:
-                again = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
+            found = compare.train_hierarchy(f'soccer/{kind}', 1, 32 * each, self.folder)
         steps = [point['control_steps'] for point in found]
         self.assertEqual(steps, [8 * each, 16 * each, 24 * each, 32 * each])
-        self.assertEqual(set(asked), {compare_hierarchy.TASKS['soccer'][kind]})
-        trainer.assert_not_called()  # the policies of a finished training are evaluated only
-        self.assertEqual(again, found)
-
-
-class TuneTest(absltest.TestCase):
-    def test_base_actions_that_no_search_has_found_get_scores(self):
-        gait = controllers.load('hopper')
-        written = {}
-        with (
-            mock.patch.object(tune_base_actions, 'VALIDATION', 2),
-            mock.patch.object(
-                tune_base_actions.tune_gait, 'write', lambda name, data: written.update(data)
-            ),
-        ):
-            obstacles = tune_base_actions.Obstacles(gait, 'mixed_hopper', gait.base_actions[0], 2)
-            tune_base_actions.score(obstacles, 'mixed_hopper', np.random.default_rng(0))
-        self.assertEqual(set(written['tuning']), {name for name, _, _ in gait.blends} - {'run'})
-        self.assertEqual(written['tuning'].pop('steady')['search'], 'steady')
-        for each in written['tuning'].values():
-            self.assertBetween(each['alone'], 0, each['set_after'])
-            self.assertBetween(each['set_before'], each['default'], each['set_after'])
-            self.assertLessEqual(each['set_after'], 1)
-
-    def test_gaits_within_the_action_range_are_stored_and_kept(self):
-        gait = controllers.load('dog')
-
-        class Strategy:
-            def __init__(self, start, sd, options):
-                self.rng, self.shape = np.random.default_rng(0), (options['popsize'], len(start))
-                self.result = mock.Mock(xfavorite=start)
-
-            def ask(self):
-                return list(self.rng.normal(0, 50, self.shape))
-
-            def tell(self, candidates, values):
-                pass
-
-        arguments = mock.Mock(population=5, generations=3, sd=1.0)
-        for within in (True, False):
-            arguments.within = within
-            with mock.patch.dict(sys.modules, cma=mock.Mock(CMAEvolutionStrategy=Strategy)):
-                found = tune_base_actions.search(
-                    lambda vectors: np.zeros(len(vectors)), gait.base_actions[3], gait, arguments,
-                    np.random.default_rng(0),
-                )  # fmt: skip
-            self.assertEqual(bool(np.abs(gait.action(found)).max() <= 1 + 1e-9), within)
-        np.testing.assert_allclose(found[0], gait.base_actions[3], atol=1e-4)
-
-        stairs = {'vector': gait.base_actions[3].tolist(), 'tuning': {'within': True}}
-        others = {'vector': gait.base_actions[1].tolist(), 'tuning': {}}
-        data = tune_gait.stored('dog')
-        with (
-            mock.patch.object(tune_base_actions.tune_gait, 'stored', lambda name: data),
-            mock.patch.object(tune_base_actions.tune_gait, 'write', lambda name, data: data),
-        ):
-            with self.assertRaisesRegex(ValueError, "'wall'.*did you mean 'walk'"):
-                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['wall'])
-            with self.assertRaisesRegex(ValueError, "'other'"):
-                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['other'])
-            tune_base_actions.add('dog', {'walk': stairs}, ['walk'])
-            written = tune_base_actions.enter('dog', {}, ['0', '1'])
-            data['action_offset'] = 1  # the default gait is the second base action
-            with self.assertRaisesRegex(ValueError, '1 gaits.*base action 1'):
-                tune_base_actions.enter('dog', {}, ['0'])
-        self.assertEqual(written['sets']['walk'], stairs['vector'])
-        self.assertEqual(written['tuning']['walk'], {'within': True})
-        self.assertNotIn('walk', [name for names in written['base_actions'] for name in names])
-
-    def test_a_steady_gait_lands_where_it_is_expected(self):
-        gait, seeds = controllers.load('hopper'), np.arange(6)
-        vectors = np.array([gait.sets['run'], gait.sets['steady'], gait.sets['foot_back']])
-        rows = len(vectors) * len(seeds) * tune_base_actions.COPIES
-        bench = tune_gait.Bench('hopper', rows, gait.action_offset)
-        score, figures = tune_base_actions.steadiness(bench, vectors, 1.4, seeds)
-        self.assertEqual(figures['spread'].shape, (3, tune_base_actions.AHEAD))
-        np.testing.assert_array_less(2 * figures['spread'][1, 1:], figures['spread'][0, 1:])
-        self.assertGreater(score[1], score[0])
-        self.assertEqual(figures['upright'][:2].tolist(), [1, 1])
-        self.assertLess(figures['upright'][2], 1)  # this action is not one to repeat
-        self.assertLess(score[2], score[0])
-        longer, again = tune_base_actions.steadiness(bench, vectors, 3.0, seeds)
-        np.testing.assert_array_equal(again['length'], figures['length'])
-        expected = (
-            score - 2 * (3.0 - figures['length']) + 2 * np.maximum(0, 1.4 - figures['length'])
-        )
-        np.testing.assert_allclose(longer, expected)
-
-    def test_base_actions_of_the_hopper_differ_in_the_length_of_a_hop(self):
-        gait = controllers.load('hopper')
-        names = [f'shorter_{n}' for n in range(5, 0, -1)] + ['steady']
-        names += [f'longer_{n}' for n in range(1, 6)]
-        bench = tune_gait.Bench('hopper', len(names), gait.action_offset)
-        environments = bench.environments
-        environments.reset(seed=[3] * len(names))
-        for _ in range(6):
-            environments.step(bench.actions(np.tile(gait.sets['steady'], (len(names), 1))))
-        before = tune_gait.position(environments)
-        np.testing.assert_array_equal(before, before[0])
-        environments.step(bench.actions(np.array([gait.sets[name] for name in names])))
-        length = tune_gait.position(environments) - before
-        np.testing.assert_array_less(0.02, np.diff(length))
-        self.assertLess(length[0], 0.6)
-        self.assertGreater(length[-1], 2.2)
+        self.assertEqual(set(asked), {compare.TASKS['soccer'][compare.KINDS.index(kind)]})
 
 
 class JobsTest(parameterized.TestCase):
@@ -305,9 +171,9 @@ class JobsTest(parameterized.TestCase):
         ({'cloned': 100.0}, 'last'),  # imitation only
         ({'cloned': 60.0}, 'policy'),
     )
-    def test_policy_of_a_run(self, settings, name):
+    def test_policy_of_a_run(self, own, name):
         folder = self.enterContext(tempfile.TemporaryDirectory())
-        curve = {'settings': {'samples': 100.0, **settings}}
+        curve = {'settings': {'samples': 100.0, **own}}
         pathlib.Path(folder, 'curve.json').write_text(json.dumps(curve))
         for number, each in enumerate(('policy', 'last')):
             policy = policies.reference('PD_Biped2D_Flat-v0')
@@ -333,7 +199,7 @@ class JobsTest(parameterized.TestCase):
     def test_policies_that_a_run_uses_are_trained_before(self):
         seen = set()
         for id_, _ in train_all.jobs('*'):
-            start = ppo_settings.settings_for(id_).start
+            start = settings.settings_for(id_).start
             if start and start not in ppo.TEACHERS:
                 self.assertIn(start, seen, id_)
             if '_HLC_' in id_:
@@ -364,13 +230,13 @@ class JobsTest(parameterized.TestCase):
         self.assertIn(f'{incline:40}    1  RuntimeError: not trained, since', out.getvalue())
 
     def test_a_run_in_progress_is_not_overwritten(self):
-        runs = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-        folder = runs / 'PD_Biped2D_Flat-v0' / 'seed_1'
+        output = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        folder = output / 'PD_Biped2D_Flat-v0' / 'seed_1'
         work = train_all.in_processes(
-            train_all.parsed(['--runs', str(runs), '--overwrite', '--samples', '1'])
+            train_all.parsed(['--runs', str(output), '--overwrite', '--samples', '1'])
         )
         with (
-            checkpoints.only_run(folder),
+            runs.only_run(folder),
             self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
         ):
             work('PD_Biped2D_Flat-v0', 1)
@@ -439,7 +305,7 @@ class JobsTest(parameterized.TestCase):
     def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
         for id_ in catalogue.BY_ID:
-            start = ppo_settings.settings_for(id_).start
+            start = settings.settings_for(id_).start
             if start in catalogue.BY_ID:
                 own, other = (
                     (list(characters.CHARACTERS[spec.character].joints), spec.actuation)
@@ -452,17 +318,17 @@ class RandomizedTest(parameterized.TestCase):
     """Policies that were trained further in worlds and with sensors that vary."""
 
     def test_every_run_continues_from_the_shipped_policy(self):
-        for id_ in ppo_settings.RANDOMIZED:
-            settings = ppo_settings.randomized_settings_for(id_)
-            self.assertEqual(settings.start, id_)
-            [(begin, options)] = settings.stages
-            self.assertEqual((begin, settings.evaluated_with.items() <= options.items()), (0, True))
-            self.assertEqual(settings.evaluated_with.keys(), {'randomize', 'sensors'})
+        for id_ in settings.RANDOMIZED:
+            own = settings.randomized_settings_for(id_)
+            self.assertEqual(own.start, id_)
+            [(begin, options)] = own.stages
+            self.assertEqual((begin, own.evaluated_with.items() <= options.items()), (0, True))
+            self.assertEqual(own.evaluated_with.keys(), {'randomize', 'sensors'})
             self.assertNotIn('pushes', options)  # those of the preset
-            self.assertEqual(settings.hidden, ppo_settings.settings_for(id_).hidden)
+            self.assertEqual(own.hidden, settings.settings_for(id_).hidden)
 
     def test_every_run_is_shipped(self):
-        self.assertEqual(policies.available('randomized'), tuple(sorted(ppo_settings.RANDOMIZED)))
+        self.assertEqual(policies.available('randomized'), tuple(sorted(settings.RANDOMIZED)))
 
     @parameterized.parameters(*((id_,) for id_ in policies.available('randomized') or (None,)))
     def test_what_is_shipped_keeps_its_return(self, id_):
@@ -472,10 +338,10 @@ class RandomizedTest(parameterized.TestCase):
         """
         if id_ is None:
             self.skipTest('no policy is shipped')
-        entry = json.loads(train_randomized.place(id_).read_text())
-        before, settings = entry['before'], ppo_settings.randomized_settings_for(id_)
-        default = dataclasses.asdict(ppo_settings.Settings())  # of settings that were added later
-        expected = json.loads(json.dumps(dataclasses.asdict(settings)))
+        entry = runs.read(train_randomized.place(id_))
+        before, own = entry['before'], settings.randomized_settings_for(id_)
+        default = dataclasses.asdict(settings.Settings())  # of settings that were added later
+        expected = json.loads(json.dumps(dataclasses.asdict(own)))
         self.assertEqual(json.loads(json.dumps(default)) | entry['settings'], expected)
         found = {name: result['return'] for name, result in entry['evaluations'].items()}
         self.assertGreater(found['none'], 0.9 * before['none']['return'])
@@ -532,8 +398,7 @@ class GeneralistTest(FolderTest):
         if ids[0] not in policies.available('generalist'):
             self.skipTest('no policy is shipped')
         self.assertContainsSubset(ids, policies.available('generalist'))
-        path = resources.directory('trained') / 'generalist' / f'{ids[-2]}.json'
-        entry = json.loads(path.read_text())
+        entry = runs.read(f'generalist/{ids[-2]}.json')
         self.assertEqual(entry['ids'], ids)
         self.assertEqual(
             entry['settings'],
@@ -585,7 +450,7 @@ class TrimTest(absltest.TestCase):
             columns=[4, 3, 1, 0], weights=[rng.normal(size=(4, 2))], biases=[[0, 0]],
             log_std=[0, 0],
         )  # fmt: skip
-        trimmed = train_all.trimmed(policy)
+        trimmed = networks.trimmed(policy)
         self.assertEqual(trimmed.columns.tolist(), [4, 3, 0])  # a constant counts
         observation = rng.normal(size=(9, 5)) / 10
         observation[:, 1] = 0.0
@@ -602,7 +467,7 @@ class TrimTest(absltest.TestCase):
             mean=np.zeros(5), std=[1, 1, 1, 0.01, 1], clip=10, activation='relu',
             weights=[rng.normal(size=(7, 2))], biases=[[0, 0]], log_std=[0, 0], convolution=line,
         )  # fmt: skip
-        trimmed = train_all.trimmed(policy)
+        trimmed = networks.trimmed(policy)
         observation = rng.normal(size=(9, 5)) / 30
         np.testing.assert_allclose(trimmed(observation), policy(observation), atol=5e-3)
         for weights in (trimmed.weights[0], trimmed.convolution.weights[0]):
@@ -634,25 +499,19 @@ class TrimTest(absltest.TestCase):
 
 
 class ProgramsTest(parameterized.TestCase):
-    @parameterized.parameters(
-        *(
-            path.name
-            for path in sorted(pathlib.Path(ppo.__file__).parent.glob('*.py'))
-            if '__main__' in path.read_text() or '.parse_args(' in path.read_text()
-        )
-    )
-    def test_every_program_ends_errors_in_one_line(self, name):
-        """Either when it is run, or before it parses its arguments; modules of others parse none."""
-        text = (pathlib.Path(ppo.__file__).parent / name).read_text()
-        body = text.split("if __name__ == '__main__':")[-1]
-        self.assertRegex(body, r'(?m)^(    )?begin_script\(\)$')
+    def test_every_program_ends_errors_in_one_line(self):
+        folder = pathlib.Path(ppo.__file__).parent
+        for path in (*folder.glob('*.py'), *folder.with_name('examples').glob('*.py')):
+            text = path.read_text()
+            if '__main__' in text or ('.parse_args(' in text and path.parent != folder):
+                self.assertRegex(text, r'(?m)^(    )?begin_script\(\)$', path.name)
 
 
 class TransferTest(parameterized.TestCase):
     def test_flat_ground_of_every_environment(self):
         for spec in catalogue.SPECS:
             if spec.domain == 'plaid':
-                flat = catalogue.BY_ID[compare_transfer.flat_ground(spec)]
+                flat = catalogue.BY_ID[evaluate_references.flat_ground(spec)]
                 self.assertEqual(
                     (flat.terrain, flat.character, dict(flat.options)),
                     ('flat', spec.character, dict(spec.options)),
@@ -692,7 +551,7 @@ class PlansTest(absltest.TestCase):
         planned, direct = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_Terrain_Forest_Hard-v0'
         for id_, name, expected in (
             (planned, 'expert', expert.expert),
-            (direct, 'expert', joint_expert.joint_expert),
+            (direct, 'expert', expert.joint_expert),
             (direct, 'scripted', None),
             ('PD_Biped3D_HLC_Soccer-v0', 'expert', None),  # its footsteps have no expert
         ):
@@ -782,7 +641,7 @@ class JointExpertTest(parameterized.TestCase):
             autoreset='disabled',
             step_limit=None,
         )
-        policy, observation = joint_expert.joint_expert(environments), environments.reset()
+        policy, observation = expert.joint_expert(environments), environments.reset()
         fell, distance = 0, np.zeros(8)
         for _ in range(300):
             action = policy(observation)
@@ -801,17 +660,17 @@ class JointExpertTest(parameterized.TestCase):
         environments = VectorEnvironment(
             'PD_Biped3D_Terrain_Soccer_Hard-v0', 2, 0, seed=3, autoreset='disabled'
         )
-        used, observation = joint_expert.joint_expert(environments), environments.reset()
+        used, observation = expert.joint_expert(environments), environments.reset()
         for _ in range(20):
             observation = environments.step(used(observation)).observation
         observation = environments.reset()
-        fresh = joint_expert.joint_expert(environments)
+        fresh = expert.joint_expert(environments)
         np.testing.assert_array_equal(used(observation), fresh(observation))
 
     def test_rejects_unsupported_tasks(self):
         environments = VectorEnvironment('PD_Biped3D_HLC_Forest-v0', 1, 1, seed=0)
         with self.assertRaisesRegex(ValueError, 'the joint expert does not support the task'):
-            joint_expert.joint_expert(environments)
+            expert.joint_expert(environments)
 
 
 if __name__ == '__main__':

@@ -1,27 +1,23 @@
-"""Baselines of continual learning, on top of PPO from ppo.py.
+"""Baselines of continual learning, on top of PPO from `ppo.py`.
 
-    cd examples
-    trl-suite sequences run plaid_biped --learner continual_baselines:FineTuning --output ft.json
+    cd training
+    trl-suite sequences run plaid_biped --learner continual:FineTuning --output fine_tuning.json
 
-* `Scratch`: a new policy for every environment.
-* `FineTuning`: one policy, trained on one environment after the other.
-* `EWC`: the same with elastic weight consolidation (Kirkpatrick et al. 2017, arXiv:1612.00796).
-* `MultiTask`: one policy, trained on all environments from the start.
-
-All take the same number of samples in every stage; plaid.py has one more learner. A new method
-overrides `train`. Needs `pip install 'trl_suite[train]'`.
+All take the same number of samples in every stage. A new method overrides `train`. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import checkpoints
 import numpy as np
 import ppo
-import ppo_settings
+import runs
+import settings
 import torch
 from several import Several
 
@@ -30,6 +26,9 @@ from trl_suite import policies, sequences
 NUM_ENVS = 64
 STRENGTH = 1.0  # of the penalty of `EWC`, in units of the divergence from the previous policy
 FISHER_SAMPLES = 1024
+DISTILLED = 0.2  # share of a stage's samples, for the distillation of `Plaid`
+ROUNDS = 5  # of DAgger
+Expert = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 
 
 class FineTuning:
@@ -42,8 +41,8 @@ class FineTuning:
 
     def new_trainer(self) -> ppo.Trainer:
         first = self.sequence.ids[0]
-        settings = ppo_settings.settings_for(first, start='', stages=(), num_envs=NUM_ENVS)
-        return ppo.Trainer(first, self.seed, settings, 1)
+        own = settings.settings_for(first, start='', stages=(), num_envs=NUM_ENVS)
+        return ppo.Trainer(first, self.seed, own, 1)
 
     def train(self, stage: sequences.Stage) -> None:
         self.learn(stage.environments(NUM_ENVS, autoreset='disabled'), stage.budget)
@@ -66,10 +65,10 @@ class FineTuning:
         return self.trainer.exported()
 
     def save(self, folder: pathlib.Path) -> None:
-        checkpoints.save(self.trainer.learnt(), folder / 'learner.pt')
+        runs.save(self.trainer.learnt(), folder / 'learner.pt')
 
     def load(self, folder: pathlib.Path) -> None:
-        self.trainer.set_learnt(checkpoints.load(folder / 'learner.pt'))
+        self.trainer.set_learnt(runs.load(folder / 'learner.pt'))
 
 
 class Scratch(FineTuning):
@@ -142,15 +141,73 @@ class EWC(FineTuning):
 
     def save(self, folder: pathlib.Path) -> None:
         super().save(folder)
-        checkpoints.save({'anchor': self.anchor, 'fisher': self.fisher}, folder / 'ewc.pt')
+        runs.save({'anchor': self.anchor, 'fisher': self.fisher}, folder / 'ewc.pt')
 
     def load(self, folder: pathlib.Path) -> None:
         super().load(folder)
-        state = checkpoints.load(folder / 'ewc.pt')
+        state = runs.load(folder / 'ewc.pt')
         self.anchor, self.fisher = state['anchor'], state['fisher']
+
+
+class Plaid(FineTuning):
+    """PLAiD: progressive learning and integration via distillation.
+
+    In every stage PPO trains the policy on the next terrain, for which it becomes an expert. Then
+    this expert and the previous policy, an expert for all earlier terrains, are distilled into one
+    policy, from which the next stage starts. Samples of both parts count; distillation takes some of
+    them on earlier terrains. G. Berseth, C. Xie, P. Cernek, M. van de Panne: Progressive
+    Reinforcement Learning with Distillation for Multi-Skilled Motion Control. ICLR 2018.
+    """
+
+    def train(self, stage: sequences.Stage) -> None:
+        seen = stage.ids[: stage.number + 1]
+        before = self.policy()
+        distilled = int(DISTILLED * stage.budget) if stage.number else 0
+        environments = stage.environments(self.trainer.settings.num_envs, autoreset='disabled')
+        self.learn(environments, stage.budget - distilled)
+        if distilled:
+            experts = [before] * stage.number + [self.policy()]
+            distil(self.trainer, together(stage, seen), experts, distilled)
 
 
 def together(stage: sequences.Stage, ids: tuple[str, ...]) -> Several:
     """Makes `NUM_ENVS` simulations or a few fewer, as many of each environment."""
     each = NUM_ENVS // len(ids)
     return Several([stage.environments(each, id, autoreset='disabled') for id in ids])
+
+
+def distil(
+    trainer: ppo.Trainer, environments: Several, experts: Sequence[Expert], samples: int,
+    rounds: int = ROUNDS,
+) -> None:  # fmt: skip
+    """Fits the policy of a trainer to experts, in states that it visits itself.
+
+    DAgger: Ross et al. 2011, arXiv:1011.0686.
+
+    Args:
+      trainer: its policy acts, with its exploration noise, and is fitted after every round to all
+        labels so far.
+      environments: one part for every expert.
+      experts: each labels the observations of its part.
+      samples: largest number of samples, in all rounds together.
+      rounds: number of rounds.
+    """
+    trainer.enter(environments)
+    std = trainer.log_std.exp().detach().numpy()
+    steps = samples // environments.num_envs
+    seen: list[np.ndarray] = []
+    labels: list[np.ndarray] = []
+    for part in np.array_split(np.arange(steps), rounds):
+        for _ in part:
+            observation = trainer.observation
+            parts = environments.split(observation)
+            actions = [expert(o) for expert, o in zip(experts, parts, strict=True)]
+            seen.append(observation)
+            labels.append(np.clip(np.concatenate(actions), -1, 1))
+            action = trainer.means(observation)
+            step = environments.step(action + std * trainer.random.standard_normal(action.shape))
+            ended = step.terminated | step.truncated
+            trainer.observation = environments.reset(ended) if ended.any() else step.observation
+        if len(part):
+            trainer.scales.update(np.concatenate(seen[-len(part) :]))
+            trainer.fit(seen, labels)

@@ -1,36 +1,39 @@
-"""Searches for gaits that pass obstacles at which a character's other gaits fall.
+"""Searches for gaits: the default gait of a character, and gaits that its policies select from.
 
-    python training/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
-    python training/tune_base_actions.py goat --terrain cliffs_rugged --alone
-    python training/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
-    python training/tune_base_actions.py hopper --steady 1.4 --generations 60
-    python training/tune_base_actions.py hopper --score mixed_hopper
+    python training/tune_gaits.py goat default --start climb0_050
+    python training/tune_gaits.py biped2d_simbicon complement --terrain gaps walls steps
+    python training/tune_gaits.py goat alone --terrain cliffs_rugged
+    python training/tune_gaits.py hopper steady --length 1.4 --generations 60
+    python training/tune_gaits.py goat enter --gaits tuned cliffs_rugged_1 climb0_075
 
-For each terrain, in the order given, the gaits found so far run over it until they fall, and the states
-one to three cycles before these falls are stored. The score of a gait in a state is the distance
-travelled with that gait for one cycle (two if the legs change roles each cycle) and the default gait in
-the next cycles, divided by `USUAL` times the distance of as many cycles of the default gait on flat
-ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best
-gait. CMA-ES (Hansen 2016, arXiv:1604.00772) searches for the gait that increases the score of the set
-most. The stored scores are those in states that were not used by the search.
+CMA-ES (Hansen 2016, arXiv:1604.00772) searches over the parameters that an action sets, in units of the
+gait's search scale.
 
-With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
-travelled, divided by the distance at the target speed.
+`default`: a gait to repeat on flat ground. Its score (`Runs.score`) is the mean over noisy starts, the
+same for all candidates of a generation, with the coefficients of friction in `FRICTIONS` in turn. The
+first 25 generations have a short horizon, the others a long one. The best of the last candidates on new
+starts is written into `trl_suite/controllers/CHARACTER.json` as set 'tuned', and becomes action 0.
 
-With `--within` only gaits that an action can set are searched for. A policy can select them without
-a change of the base actions, and so of the action range: `--add` stores them in the character's file, and
-`learn_gaits.py` reads them with its setting `gaits`.
+`complement`: for each terrain, in the order given, the gaits found so far run over it until they fall, and
+the states one to three cycles before these falls are stored. The score of a gait in a state is the
+distance travelled with that gait for one cycle (two if the legs change roles each cycle) and the default
+gait in the next cycles, divided by `USUAL` times the distance of as many cycles of the default gait on
+flat ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best
+gait; a gait is searched for that increases it most. Stored scores are those in other states.
 
-With `--steady LENGTH` a gait is searched for with cycles of at least this length whose landing place
-depends as little as possible on the state, so that a policy can foresee it: after `SETTLED` cycles on
-flat ground the joint angles (and slides) of copies of a simulation are changed at random, and the
-score is high where the copies are still close together one to `AHEAD` cycles later. Falls, cycles that
-are shorter, and speeds far from the target speed reduce it.
+`alone`: a gait is repeated from the start of an episode instead, and its score is the distance travelled,
+divided by the distance at the target speed.
 
-Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
-gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`. `--score`
-measures the base actions that were not found by a search, and writes their scores into this file.
-Needs `pip install 'trl_suite[tune]'`.
+`steady`: a gait with cycles of at least `--length`, whose landing place depends as little as possible on
+the state, so that a policy can foresee it: after `SETTLED` cycles on flat ground the joint angles (and
+slides) of copies of a simulation are changed at random, and the score is high where the copies are still
+close together one to `AHEAD` cycles later. Falls, shorter cycles, and other speeds reduce it.
+
+With `--within` only gaits that an action can set are searched for. A policy can select them without a
+change of the base actions, and so of the action range: `learn_gaits.py` reads them with its setting
+`gaits`. Gaits that were found are in OUTPUT/CHARACTER.json with records of the searches. `enter` makes
+gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`; `add`
+stores gaits that were found with `--within`. Needs `pip install 'trl_suite[tune]'`.
 """
 
 from __future__ import annotations
@@ -43,29 +46,32 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import tune_gait
+from gait_bench import FRICTION, HORIZON, Bench, nudged, position, stored, vector_of, write
 
 from trl_suite import controllers
 from trl_suite.controllers import Parameters
 from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 
+# Of `default`: horizon of the first generations, s, and their number; frictions of the starts, in turn;
+# number of starts of a candidate, and for the result.
+SHORT, FIRST, FRICTIONS, EACH, EPISODES = 6.0, 25, (FRICTION, 0.6, 1.0), 3, 20
+FINAL_SEED = 2**31  # combined with the seed of the search for the finalists' starts
 BACK = 3  # largest number of cycles from a state to the fall
 AFTER = 3  # cycles with the default gait after those with the candidate
 USUAL = 0.8  # share of the distance on flat ground that gives the full score
 OTHERS = 0.3  # share of the cycles before a fall with a gait drawn from all, instead of the first
-HORIZON = 8.0  # s, with `--alone`
+ALONE = 8.0  # s, horizon
 STATES, VALIDATION = 32, 64  # numbers of states for the search, and for the stored scores
-STARTS = 6  # number of noisy starts; twice as many with `--steady`
-FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
-FRICTION = 0.81
-# With `--steady`: cycles before and after the change; copies of each start; standard deviation of the
+STARTS = 6  # number of noisy starts; twice as many of `steady`
+# Of `steady`: cycles before and after the change; copies of each start; standard deviation of the
 # change, rad (slides: m); spread that counts as none, m; tolerance of the speed, m/s.
 SETTLED, AHEAD, COPIES, CHANGE, CLOSE, SPEED_TOLERANCE = 4, 3, 4, 0.02, 3e-3, 0.6
 # Weights of falls, of missing length (1/m) and of the speed (s/m) in the score.
 FALLS, LENGTH, SPEED = 3.0, 2.0, 0.3
-DIGITS = 4
-HAND = 'by hand'  # how sets were found that no search has found
+# By the search: initial standard deviation, in search scales; candidates of a generation; generations;
+# decimals of the parameters; finalists, the best of this number of last generations.
+DEFAULT, OTHER = (0.35, 16, 35, 6, 7), (0.5, 12, 30, 4, 5)
 
 
 class Obstacles:
@@ -79,10 +85,10 @@ class Obstacles:
     def __init__(self, gait: Parameters, terrain: str, default: np.ndarray, num_envs: int) -> None:
         self.gait, self.default = gait, default
         self.lead = 2 if gait.kind == 'stride' else 1
-        self.bench = tune_gait.Bench(gait.character, num_envs, gait.action_offset, terrain)
+        self.bench = Bench(gait.character, num_envs, gait.action_offset, terrain)
         self.bench.environments.reset()
-        flat = tune_gait.Bench(gait.character, STARTS, gait.action_offset)
-        runs = tune_gait.measure(flat, default, [FRICTION])
+        flat = Bench(gait.character, STARTS, gait.action_offset)
+        runs = flat.measure(default, [FRICTION])
         flat.environments.close()
         self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
 
@@ -122,7 +128,7 @@ class Obstacles:
             going = np.arange(len(part) * count)
             for i in going.tolist():
                 environments.set_state(states[i % count], [i])
-            begin = tune_gait.position(environments)[going]
+            begin = position(environments)[going]
             reached = begin.copy()
             candidate, default = np.zeros((2, environments.num_envs, len(self.gait.actions)))
             candidate[going] = np.repeat(self.bench.actions(part), count, axis=0)
@@ -130,7 +136,7 @@ class Obstacles:
             for cycle in range(self.lead + AFTER):
                 step = environments.step(candidate if cycle < self.lead else default, going)
                 going = going[~(step.terminated | step.truncated)[going]]
-                reached[going] = tune_gait.position(environments)[going]
+                reached[going] = position(environments)[going]
                 if not len(going):
                     break
             share = np.clip((reached - begin) / self.usual, 0, 1)
@@ -145,8 +151,8 @@ class Obstacles:
         found = []
         for first in range(0, n, rows):  # the last part is filled up
             part = np.arange(first, first + rows) % n
-            runs = self.bench.run(vectors[part], seeds[part], HORIZON, np.full(rows, FRICTION))
-            found.append(runs.distance / (HORIZON * self.gait.target_speed))
+            runs = self.bench.run(vectors[part], seeds[part], ALONE, np.full(rows, FRICTION))
+            found.append(runs.distance / (ALONE * self.gait.target_speed))
         return np.clip(np.concatenate(found)[:n], 0, 1).reshape(shape)
 
 
@@ -157,16 +163,19 @@ def search(
     arguments: argparse.Namespace,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Returns the best gaits of the last generations, and the mean of the last one, (m, P)."""
+    """Returns the mean of the last generation, and the best gaits of the last ones, (m, P)."""
     import cma
 
-    def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
+    _, _, _, digits, finalists_ = DEFAULT if arguments.action == 'default' else OTHER
+
+    def vectors(candidates: Sequence[np.ndarray], rounded: bool) -> np.ndarray:
         result = np.tile(start, (len(candidates), 1))
         result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
-        result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
+        if rounded:
+            result[:, gait.actions] = result[:, gait.actions].round(digits)
         if arguments.within:
-            # Rounding to `DIGITS` would leave the range.
+            # Rounding to `digits` would leave the range.
             result = gait.vector(gait.action(result).clip(-1, 1)).round(9)
         return result
 
@@ -178,12 +187,41 @@ def search(
     finalists: list[np.ndarray] = []
     for number in range(arguments.generations):
         candidates = strategy.ask()
-        scores = objective(vectors(candidates))
+        scores = objective(vectors(candidates, arguments.action != 'default'))
         strategy.tell(candidates, -scores)
-        finalists = [*finalists, candidates[scores.argmax()]][-FINALISTS:]
+        finalists = [*finalists, candidates[scores.argmax()]][-finalists_:]
         if number % 10 == 9:
             print(f'  {number + 1:3} best {scores.max():.3f} mean {scores.mean():.3f}', flush=True)
-    return vectors([strategy.result.xfavorite, *finalists])
+    return vectors([strategy.result.xfavorite, *finalists], True)
+
+
+def default(
+    gait: Parameters, start: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Searches for a default gait; returns it (P,), and its figures."""
+    bench = Bench(gait.character, arguments.population * EACH, start)
+    generation = 0
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        nonlocal generation
+        horizon, generation = SHORT if generation < FIRST else HORIZON, generation + 1
+        seeds = rng.integers(2**32, size=EACH)
+        runs = bench.run(
+            np.repeat(vectors, EACH, axis=0), np.tile(seeds, len(vectors)), horizon,
+            np.tile(np.resize(FRICTIONS, EACH), len(vectors)),
+        )  # fmt: skip
+        return runs.score(gait.target_speed).reshape(len(vectors), EACH).mean(1)
+
+    found = search(objective, start, gait, arguments, rng)
+    bench.environments.close()
+    bench = Bench(gait.character, EPISODES * len(FRICTIONS), start)
+    seed = FINAL_SEED + arguments.seed
+    scores = [
+        bench.measure(each, FRICTIONS, seed).score(gait.target_speed).mean() for each in found
+    ]
+    chosen = found[int(np.argmax(scores))]
+    bench = Bench(gait.character, EPISODES, chosen)
+    return chosen, bench.measure(chosen, [FRICTION]).record(gait.target_speed)
 
 
 def alone(
@@ -220,7 +258,7 @@ def complement(
 
 
 def steadiness(
-    bench: tune_gait.Bench, vectors: np.ndarray, length: float, seeds: np.ndarray
+    bench: Bench, vectors: np.ndarray, length: float, seeds: np.ndarray
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Measures how much the places depend on the state that gaits (m, P) reach on flat ground.
 
@@ -243,13 +281,13 @@ def steadiness(
     places, duration = np.full((AHEAD + 1, len(going)), np.nan), np.zeros(len(going))
     for cycle in range(SETTLED + AHEAD + 1):
         if cycle >= SETTLED:
-            places[cycle - SETTLED, going] = tune_gait.position(environments)[going]
+            places[cycle - SETTLED, going] = position(environments)[going]
         if cycle == SETTLED:
             rng = np.random.default_rng(seeds)
             joints = environments.task.world.qpos.shape[1] - 3
             for i in going.tolist():
                 state = environments.get_state([i])
-                new = tune_gait.nudged(environments, state, rng.normal(0, CHANGE, joints))
+                new = nudged(environments, state, rng.normal(0, CHANGE, joints))
                 environments.set_state(new, [i])
         if cycle == SETTLED + AHEAD or not len(going):
             break
@@ -278,44 +316,29 @@ def steady(
     gait: Parameters, start: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Searches for a steady gait; returns it (P,), and figures of it and of the start."""
-    rows = max(arguments.population, FINALISTS + 1) * 2 * STARTS * COPIES
-    bench = tune_gait.Bench(gait.character, rows, gait.action_offset)
+    rows = max(arguments.population, OTHER[-1] + 1) * 2 * STARTS * COPIES
+    bench = Bench(gait.character, rows, gait.action_offset)
 
     def measured(vectors: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return steadiness(bench, vectors, arguments.steady, rng.integers(2**32, size=2 * STARTS))
+        return steadiness(bench, vectors, arguments.length, rng.integers(2**32, size=2 * STARTS))
 
     found = search(lambda vectors: measured(vectors)[0], start, gait, arguments, rng)
     chosen = found[measured(found)[0].argmax()]
     score, figures = measured(np.array([start, chosen]))
     bench.environments.close()
-    return chosen, {
+    return chosen, {'terrain': 'flat', 'cycle': arguments.length} | {
         name: {key: np.round(value[row], 3).tolist() for key, value in figures.items()}
         | {'score': round(float(score[row]), 3)}
         for row, name in enumerate(('start', 'found'))
     }
 
 
-def score(obstacles: Obstacles, terrain: str, rng: np.random.Generator) -> pathlib.Path:
-    """Writes the scores of the base actions that are sets chosen by hand, in states before falls."""
-    gait = obstacles.gait
-    states = obstacles.collect(gait.base_actions, VALIDATION, rng)
-    scores = obstacles.scores(gait.base_actions, states)
-    data = tune_gait.stored(gait.character)
-    tuning = data.setdefault('tuning', {})
-    originals = {name for a, b, _ in data.get('original_base_actions', ()) for name in (a, b)}
-    for number, (name, _, blend) in enumerate(gait.blends):
-        if (
-            blend == 0
-            and name not in originals
-            and tuning.get(name, {}).get('search', HAND) == HAND
-        ):
-            tuning[name] = {
-                'terrain': terrain, 'search': HAND, 'default': round(float(scores[0].mean()), 3),
-                'set_before': round(float(np.delete(scores, number, 0).max(0).mean()), 3),
-                'alone': round(float(scores[number].mean()), 3),
-                'set_after': round(float(scores.max(0).mean()), 3),
-            }  # fmt: skip
-    return tune_gait.write(gait.character, data)
+def enter_default(character: str, vector: np.ndarray, record: dict[str, Any]) -> pathlib.Path:
+    """Enters a gait as set 'tuned' and as action 0."""
+    data = stored(character)
+    data['sets']['tuned'], data['action_offset'] = vector.tolist(), 'tuned'
+    data.setdefault('tuning', {})['tuned'] = record
+    return write(character, data)
 
 
 def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
@@ -327,28 +350,25 @@ def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathli
     Raises:
       ValueError: a name is unknown, or there are too few.
     """
-    data = tune_gait.stored(character)
-    default = data['action_offset']
-    if isinstance(default, int) and default >= len(names):
-        raise ValueError(f'{len(names)} gaits; the default gait is base action {default}')
-    data.setdefault('tuning', {})
+    data = stored(character)
+    offset = data['action_offset']
+    if isinstance(offset, int) and offset >= len(names):
+        raise ValueError(f'{len(names)} gaits; the default gait is base action {offset}')
     original = data.setdefault('original_base_actions', data['base_actions'])
     numbers = list(map(str, range(len(original))))
+    errors.check_known('gait', [*found, *data['sets'], *numbers], *names)
     for name in names:
         if name in found:
-            data['sets'][name] = found[name]['vector']
-            data['tuning'][name] = found[name]['tuning']
-        elif name not in data['sets'] and name not in numbers:
-            raise ValueError(errors.unknown('gait', name, [*found, *data['sets'], *numbers]))
+            _store(data, found, name)
     data['base_actions'] = [
         original[int(name)] if name in numbers else [name, name, 0] for name in names
     ]
     used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
-    used.add(default)
-    used |= {name for name, record in data['tuning'].items() if record.get('within')}
+    used.add(offset)
+    used |= {name for name, record in data.get('tuning', {}).items() if record.get('within')}
     for part in ('sets', 'tuning'):
-        data[part] = {name: value for name, value in data[part].items() if name in used}
-    return tune_gait.write(character, data)
+        data[part] = {name: value for name, value in data.get(part, {}).items() if name in used}
+    return write(character, data)
 
 
 def add(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
@@ -357,113 +377,97 @@ def add(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.
     Raises:
       ValueError: there is no such gait.
     """
-    data = tune_gait.stored(character)
+    data = stored(character)
     within = [name for name, record in found.items() if record['tuning'].get('within')]
+    errors.check_known('gait within the action range', within, *names)
     for name in names:
-        if name not in within:
-            raise ValueError(errors.unknown('gait within the action range', name, within))
-        data['sets'][name] = found[name]['vector']
-        data.setdefault('tuning', {})[name] = found[name]['tuning']
-    return tune_gait.write(character, data)
+        _store(data, found, name)
+    return write(character, data)
+
+
+def _store(data: dict[str, Any], found: dict[str, Any], name: str) -> None:
+    data['sets'][name] = found[name]['vector']
+    data.setdefault('tuning', {})[name] = found[name]['tuning']
+
+
+def parsed() -> argparse.Namespace:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('character', choices=controllers.available())
+    actions = ('default', 'complement', 'alone', 'steady', 'enter', 'add')
+    parser.add_argument('action', choices=actions)
+    parser.add_argument('--terrain', nargs='+', help='of complement and alone: one gait for each')
+    parser.add_argument('--length', type=float, help='of steady: shortest cycle, m')
+    parser.add_argument(
+        '--gaits', nargs='+', help='of enter and add: sets, or numbers of base actions'
+    )
+    parser.add_argument('--start', nargs='+', help='sets, or numbers of base actions')
+    parser.add_argument('--within', action='store_true', help='search within the action range')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--sd', type=float, help='initial standard deviation, in search scales')
+    parser.add_argument('--population', type=int)
+    parser.add_argument('--generations', type=int)
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    arguments = parser.parse_args()
+    usual = DEFAULT if arguments.action == 'default' else OTHER
+    for name, value in zip(('sd', 'population', 'generations'), usual, strict=False):
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, value)
+    needs = {'steady': 'length', 'enter': 'gaits', 'add': 'gaits'}
+    needs |= dict.fromkeys(('complement', 'alone'), 'terrain')
+    needed = needs.get(arguments.action)
+    if needed and getattr(arguments, needed) is None:
+        parser.error(f'{arguments.action} needs --{needed}')
+    if arguments.length is not None and not 0 < arguments.length < np.inf:
+        parser.error(f'argument --length: {arguments.length}; expected a length above 0 m')
+    return arguments
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('character', choices=controllers.available())
-    parser.add_argument('--within', action='store_true', help='search within the action range')
-    parser.add_argument('--alone', action='store_true', help='repeat the gait; with --terrain')
-    group = parser.add_mutually_exclusive_group(required=True)
-    group.add_argument('--terrain', nargs='+', help='terrains; one gait is searched for each')
-    group.add_argument(
-        '--steady', type=float, metavar='LENGTH', help='search for a gait with such cycles, m'
-    )
-    parser.add_argument(
-        '--start', nargs='+', help='sets, or numbers of base actions; default: the default gait'
-    )
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument(
-        '--sd', type=float, default=0.5, help='initial standard deviation, in search scales'
-    )
-    parser.add_argument('--population', type=int, default=12)
-    parser.add_argument('--generations', type=int, default=30)
-    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
-    group.add_argument(
-        '--enter',
-        nargs='+',
-        metavar='SET',
-        help='sets, or numbers of base actions of the original, that become the base actions',
-    )
-    group.add_argument(
-        '--add', nargs='+', metavar='SET', help='sets, found with --within, that are stored'
-    )
-    group.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
-    arguments = parser.parse_args()
-    if arguments.steady is not None and not 0 < arguments.steady < np.inf:
-        parser.error(f'argument --steady: {arguments.steady}; expected a length above 0 m')
-    gait = controllers.load(arguments.character)
+    arguments = parsed()
+    action, gait = arguments.action, controllers.load(arguments.character)
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / f'{gait.character}.json'
-    stored = json.loads(path.read_text()) if path.exists() else {}
-
-    if arguments.enter:
-        print(enter(gait.character, stored, arguments.enter))
+    found = json.loads(path.read_text()) if path.exists() else {}
+    if action in ('enter', 'add'):
+        print({'enter': enter, 'add': add}[action](gait.character, found, arguments.gaits))
         return
-
-    if arguments.add:
-        print(add(gait.character, stored, arguments.add))
-        return
-
-    if arguments.score:
-        obstacles = Obstacles(gait, arguments.score, gait.action_offset, VALIDATION)
-        print(score(obstacles, arguments.score, np.random.default_rng(arguments.seed)))
-        return
-
-    def vector(name: str) -> np.ndarray:
-        if name in stored:
-            return np.array(stored[name]['vector'])
-        return tune_gait.vector_of(gait, name)
-
-    known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
+    known = [
+        np.array(found[name]['vector']) if name in found else vector_of(gait, name)
+        for name in arguments.start or (None,)
+    ]
     rng = np.random.default_rng(arguments.seed)
-    settings = {'known': arguments.start or ['default gait']} | {
+    settings = {'search': action, 'known': arguments.start or ['default gait']} | {
         name: getattr(arguments, name)
         for name in ('seed', 'generations', 'population', 'sd', 'within')
     }
-
-    def add_found(kind: str, vector: np.ndarray, record: dict[str, Any]) -> None:
-        number = 1 + sum(name.rsplit('_', 1)[0] == kind for name in stored)
-        stored[f'{kind}_{number}'] = {'vector': vector.tolist(), 'tuning': record}
-        print(f'{kind}_{number}', record, flush=True)
-        files.write_json(stored, path)
-
-    if arguments.steady is not None:
-        began = time.process_time()
-        chosen, figures = steady(gait, known[0], arguments, rng)
-        record = {
-            'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
-            **settings, **figures,
-            'cpu_seconds': round(time.process_time() - began),
-        }  # fmt: skip
-        add_found(steady.__name__, chosen, record)
-    for terrain in arguments.terrain or ():
+    for terrain in arguments.terrain or ('flat',):
         began = time.process_time()
         print(gait.character, terrain, flush=True)
-        have = np.array(known)
-        num_envs = arguments.population * (STARTS if arguments.alone else STATES)
-        obstacles = Obstacles(gait, terrain, have[0], num_envs)
-        tune = alone if arguments.alone else complement
-        chosen, scores = tune(obstacles, have, arguments, rng)
-        obstacles.bench.environments.close()
-        record = {
-            'terrain': terrain, 'search': tune.__name__, **settings,
-            'default': round(float(scores[0].mean()), 3),
-            'set_before': round(float(scores[:-1].max(0).mean()), 3),
-            'alone': round(float(scores[-1].mean()), 3),
-            'set_after': round(float(scores.max(0).mean()), 3),
-            'cpu_seconds': round(time.process_time() - began),
-        }  # fmt: skip
-        known.append(chosen)
-        add_found(terrain, chosen, record)
+        if action in ('default', 'steady'):
+            tune = default if action == 'default' else steady
+            chosen, record = tune(gait, known[0], arguments, rng)
+        else:
+            num_envs = arguments.population * (STARTS if action == 'alone' else STATES)
+            obstacles = Obstacles(gait, terrain, known[0], num_envs)
+            tune_set = alone if action == 'alone' else complement
+            chosen, scores = tune_set(obstacles, np.array(known), arguments, rng)
+            obstacles.bench.environments.close()
+            means = scores[0], scores[:-1].max(0), scores[-1], scores.max(0)
+            names = 'default', 'set_before', 'alone', 'set_after'
+            record = {'terrain': terrain} | {
+                name: round(float(each.mean()), 3) for name, each in zip(names, means, strict=True)
+            }
+            known.append(chosen)
+        record = {**settings, **record, 'cpu_seconds': round(time.process_time() - began)}
+        if action == 'default':
+            print(enter_default(gait.character, chosen, record))
+            return
+        kind = 'steady' if action == 'steady' else terrain
+        name = f'{kind}_{1 + sum(each.rsplit("_", 1)[0] == kind for each in found)}'
+        found[name] = {'vector': chosen.tolist(), 'tuning': record}
+        print(name, record, flush=True)
+        files.write_json(found, path)
 
 
 if __name__ == '__main__':

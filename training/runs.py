@@ -1,4 +1,4 @@
-"""Files of training runs: checkpoints, with a check of their integrity, and curves; one run per folder.
+"""What all trainings share: command line, checkpoints with a check of their integrity, files of results.
 
 A checkpoint is a line that names the format, a line with the SHA-256 of the rest, and the output of
 `torch.save`. It is read with `weights_only`, so that loading a file cannot run code: it may contain
@@ -7,22 +7,27 @@ dicts, lists, tuples, numbers, strings, tensors and arrays.
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import contextlib
 import dataclasses
 import hashlib
 import io
 import json
+import os
 import pathlib
+import platform
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 
-from trl_suite.util import files
+from trl_suite import suite
+from trl_suite.util import files, resources
 
+EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
 FORMAT = b'trl_suite checkpoint 1\n'
 LARGEST = 2**32  # bytes
 # Globals in pickled arrays; `bytes` in empty ones.
@@ -31,6 +36,42 @@ ARRAYS = [
     bytes,
     *(type(np.dtype(kind)) for kind in '?bhilqBHILQefd'),
 ]  # fmt: skip
+
+
+def command_line(
+    description: str, sample: str, further: Mapping[str, Mapping[str, Any]] | None = None
+) -> tuple[str, int, dict[str, Any], pathlib.Path, int]:
+    """Parses the command line of a training program.
+
+    Args:
+      description: description of the program.
+      sample: what its samples are.
+      further: further settings, and keyword arguments of `argparse.ArgumentParser.add_argument`.
+
+    Returns:
+      Id, seed, settings other than the defaults, folder and threads.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=0, help='0: all cores')
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
+    for name, keywords in (further or {}).items():
+        parser.add_argument(f'--{name}', help='instead of the default', **keywords)
+    chosen = parser.parse_args()
+    id_ = suite.find(chosen.id).id
+    given = {name: getattr(chosen, name) for name in ('samples', *(further or ()))}
+    changes = {name: value for name, value in given.items() if value is not None}
+    return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
+
+
+def passed(before: float, now: float, every: float) -> bool:
+    """Returns whether a multiple of `every` has been reached since `before`."""
+    return now // every > before // every
+
+
+# Files of a run.
 
 
 def write_curve(
@@ -77,9 +118,7 @@ def load(path: pathlib.Path) -> dict[str, Any]:
     try:
         with torch.serialization.safe_globals(ARRAYS):
             return torch.load(io.BytesIO(data), weights_only=True)
-    except (
-        Exception
-    ) as error:  # UnpicklingError and others; torch's message suggests to trust the file
+    except Exception as error:  # torch's message suggests to trust the file
         other = re.search(r'GLOBAL (\S+)', str(error))
         raise ValueError(
             f'{path}: the checkpoint contains {other[1] if other else "other objects"}; '
@@ -117,3 +156,34 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
     what = f'trains in {folder}; wait for it, or give another --output'
     with files.locked(folder / '.lock', what):
         yield
+
+
+# Results in `trained/`, or in the folder TRL_SUITE_TRAINED.
+
+
+def machine() -> str:
+    """Returns a description of this machine for results."""
+    return f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
+
+
+def place(name: str) -> pathlib.Path:
+    """Returns the path of a file with results."""
+    return resources.directory('trained') / name
+
+
+def read(name: str) -> dict[str, Any]:
+    """Returns the content of a .json file with results, {} if there is none."""
+    path = place(name)
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def write(name: str, content: Any) -> None:
+    """Writes a .json file with results in one line, since they have long lists."""
+    place(name).parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(place(name)) as part:
+        part.write_text(json.dumps(content) + '\n')
+
+
+def enter(name: str, key: str, value: Any) -> None:
+    """Enters a result into a .json file."""
+    write(name, dict(sorted({**read(name), key: value}.items())))

@@ -2,9 +2,9 @@
 
 import evaluate_footsteps
 import numpy as np
-import oracle_falls
-import oracle_gaits
+import oracles
 from absl.testing import absltest
+from gait_bench import nudged, position
 
 from trl_suite import policies
 from trl_suite.vector import VectorEnvironment
@@ -22,24 +22,25 @@ class OracleTest(absltest.TestCase):
         def default(observation):
             return np.zeros((len(observation), size))
 
-        states, places, pace = oracle_gaits.falls(environments, default)
+        states, places, pace = oracles.falls(environments, default, oracles.BACK)
         self.assertBetween(pace, 0.5, 2.4)  # hops are 2.4 m long; those into gaps are shorter
         copies = VectorEnvironment(HOPPER, 2, 1, 1, autoreset='disabled', step_limit=None)
         copies.reset()
         for each, place in zip(states, places, strict=True):
-            self.assertLen(each, oracle_gaits.BACK)
+            self.assertLen(each, oracles.BACK)
             for back, state in enumerate(each, 1):
                 copies.set_state(state, [0])
                 for cycle in range(back):
                     self.assertFalse(copies.task.failed[0] and cycle)
                     step = copies.step(default(copies.task.observation), [0])
                 self.assertTrue(step.terminated[0], back)
-                self.assertEqual(oracle_gaits.position(copies)[0], place)
+                self.assertEqual(position(copies)[0], place)
                 # The same action falls again; at a place far behind nothing is prevented by it.
                 for nearer, expected in ((0.0, False), (1e3, True)):
-                    found = oracle_gaits.prevented(
-                        copies, [state] * 2, place + 0.5 - nearer, np.zeros((2, size)), default
-                    )
+                    found = oracles.prevented(
+                        copies, [state] * 2, lambda _, seen: default(seen), oracles.MOST_CYCLES,
+                        place + 0.5 - nearer,
+                    )  # fmt: skip
                     self.assertEqual(found.tolist(), [expected] * 2 if back > 1 else [False] * 2)
 
     def test_only_the_joint_angles_of_a_state_are_changed(self):
@@ -47,7 +48,7 @@ class OracleTest(absltest.TestCase):
         environments.reset()
         state, task = environments.get_state([0]), environments.task
         before = [task.world.qpos.copy(), task.world.qvel.copy()]
-        changed = oracle_gaits.nudged(environments, state, np.array([0.1, -0.2]))
+        changed = nudged(environments, state, np.array([0.1, -0.2]))
         environments.set_state(changed, [0])
         change = task.world.qpos - before[0]
         np.testing.assert_allclose(change, [[0, 0, 0, 0.1, -0.2], [0] * 5], atol=1e-12)
@@ -57,28 +58,28 @@ class OracleTest(absltest.TestCase):
 
     def test_every_kind_of_action_is_counted(self):
         policy = policies.reference(HOPPER)
-        found = oracle_gaits.measure(HOPPER, policy, 2, 3, 0)
+        found = oracles.of_gait(HOPPER, policy, 2, 3, 0)
         counts = {'base': 18, 'random': 3, 'nudged': 3}  # the hopper has 18 base actions
         for kind, count in counts.items():
             self.assertEqual(found[kind]['actions'], count)
-            for name in ('prevented', 'actions_that_prevent'):
-                self.assertLen(found[kind][name], oracle_gaits.BACK)
-            some, mean = (found[kind][name] for name in ('prevented', 'actions_that_prevent'))
+            for name in ('prevented', 'tries_that_prevent'):
+                self.assertLen(found[kind][name], oracles.BACK)
+            some, mean = (found[kind][name] for name in ('prevented', 'tries_that_prevent'))
             self.assertTrue(np.all(np.array(some) >= mean))
 
     def test_a_tracking_policy_falls_again_without_noise(self):
         """Noise prevents a fall if the character gets beyond its place, before or after its time."""
         policy = policies.reference(RAPTOR)
         environments = VectorEnvironment(RAPTOR, 2, 1, 0, autoreset='disabled', step_limit=None)
-        past, places, _ = oracle_gaits.falls(environments, policy, 20)
+        past, places, _ = oracles.falls(environments, policy, 20)
         copies = VectorEnvironment(RAPTOR, 2, 1, 1, autoreset='disabled', step_limit=None)
         copies.reset()
         none = np.zeros((20, 2, len(copies.action_map)))
         for each, place in zip(past, places, strict=True):
             self.assertLen(each, 20)
             for nearer, expected in ((0.0, False), (1e3, True)):
-                found = oracle_falls.prevented(
-                    copies, [each[-1]] * 2, place - nearer, none, 60, policy
+                found = oracles.prevented(
+                    copies, [each[-1]] * 2, oracles.with_noise(policy, none), 80, place + 1 - nearer
                 )
                 self.assertEqual(found.tolist(), [expected] * 2)
 
@@ -88,23 +89,22 @@ class OracleTest(absltest.TestCase):
         options = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': condition}
         row = evaluate_footsteps.row_for(FOOTSTEPS, None)
         environments = VectorEnvironment(row, 2, 1, 0, **options)
-        past, _, _ = oracle_gaits.falls(environments, policy, 15)
+        past, _, _ = oracles.falls(environments, policy, 15)
         copies = VectorEnvironment(row, 2, 1, 1, **options)
         copies.reset()
         none = np.zeros((15, 2, len(copies.action_map)))
         for each in past:
             for steps, expected in ((14, True), (15, False)):  # of the 15 until the fall
-                found = oracle_falls.prevented(
-                    copies, [each[-1]] * 2, None, none[:steps], 0, policy
-                )
+                act = oracles.with_noise(policy, none)
+                found = oracles.prevented(copies, [each[-1]] * 2, act, steps, None)
                 self.assertEqual(found.tolist(), [expected] * 2)
 
     def test_every_noise_is_counted(self):
-        found = oracle_falls.measure(RAPTOR, policies.reference(RAPTOR), 2, 3, 0)
-        self.assertEqual(list(found['noise']), [str(std) for std in oracle_falls.STDS])
+        found = oracles.of_tracking(RAPTOR, policies.reference(RAPTOR), 2, 3, 0)
+        self.assertEqual(list(found['noise']), [str(std) for std in oracles.STDS])
         for each in found['noise'].values():
             some, mean = np.array(each['prevented']), np.array(each['tries_that_prevent'])
-            self.assertLen(some, len(oracle_falls.BACK))
+            self.assertLen(some, len(oracles.SECONDS))
             self.assertTrue((some >= mean).all())
             self.assertBetween(each['ever_prevented'], some.max(), 1.0)
 

@@ -1,6 +1,6 @@
 """The settings with which `ppo.py` trains each environment, including curriculum stages.
 
-`OVERRIDES` holds the differences from the defaults of `Settings`.
+`Settings` documents them, and `OVERRIDES` is the table of differences from its defaults.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from trl_suite import terrain
 
 CLOSER = 2 / 3  # times the spacing of obstacles
 LARGER = 1.1  # times the size of the largest obstacles
+Stages = tuple[tuple[float, Any], ...]  # see `Settings.stages`
+Row = tuple[str, dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +35,10 @@ class Settings:
     gamma: float = 0.95  # a time constant of 0.67 s at 30 Hz
     lambda_: float = 0.95
     clip: float = 0.2
-    kl_per_action: float = (
-        0.004  # an update stops at this mean divergence times the number of actions
-    )
+    kl_per_action: float = 0.004  # an update stops at this divergence, times the number of actions
     value_goes_on: bool = False  # whether the value network is trained after an update has stopped
     hidden: tuple[int, ...] = (256, 256)
-    activation: str = 'tanh'  # of all layers but the last, one of `ppo.ACTIVATIONS`
+    activation: str = 'tanh'  # of all layers but the last, one of `networks.ACTIVATIONS`
     # Convolutions over the maps of the ground, with `map_bound`: filters, width and stride of each.
     convolutions: tuple[tuple[int, int, int], ...] = ()
     initial_std: float = 0.2  # of actions in [-1, 1]
@@ -106,175 +106,117 @@ class Settings:
     evaluated_with: dict[str, Any] = dataclasses.field(default_factory=dict)  # task options
 
 
-def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
-    """Returns curriculum stages of equal length on terrain that approaches a preset.
+# Terrain of curriculum stages.
+
+
+def evenly(stages: Iterable[dict[str, Any]]) -> Stages:
+    """Returns curriculum stages of equal length."""
+    listed = list(stages)
+    return tuple((i / len(listed), options) for i, options in enumerate(listed))
+
+
+def joined(*parts: Stages) -> Stages:
+    """Returns stages one after the other, of equal length; only the last part keeps its last one."""
+    *first, last = parts
+    return evenly(options for part in (*(p[:-1] for p in first), last) for _, options in part)
+
+
+def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> Stages:
+    """Returns stages of equal length on terrain that approaches a preset, which is the last.
 
     Args:
-      preset: name of the terrain, which is that of the last stage.
+      preset: name of the terrain.
       low: parameters that differ at terrain level 0.
       heights: terrain levels of the stages, from 0 to less than 1, which is the preset.
     """
-    preset_ = terrain.load(preset)
-    full = dict(preset_.parameter_sets[0])
-    ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
+    full = dict(terrain.load(preset).parameter_sets[0])
+    ground = ground_of(preset, {**full, **low}, full)
     return evenly([*({'terrain': ground, 'terrain_level': height} for height in heights), {}])
 
 
-def crowded(preset: str) -> tuple[Any, ...]:
+def ground_of(preset: str, *parameters: dict[str, float], walls: bool = False) -> dict[str, Any]:
+    """Returns terrain of a preset's type; with `walls` that of a mixed one without gaps and steps."""
+    type_ = terrain.load(preset).type
+    if walls:
+        type_ = type_.replace('mixed', 'walls')
+        parameters = tuple(
+            {name: value for name, value in each.items() if not name.startswith(('Gap', 'Step'))}
+            for each in parameters
+        )
+    return {'Type': type_, 'Params': list(parameters)}
+
+
+def crowded(preset: str) -> Stages:
     """Returns stages on closer walls, on closer obstacles of a mixed preset, and on the preset."""
-    mixed = terrain.load(preset)
     near = {
         name: CLOSER * value if 'Spacing' in name else value
-        for name, value in mixed.parameter_sets[0].items()
+        for name, value in terrain.load(preset).parameter_sets[0].items()
     }
-    walls = {name: value for name, value in near.items() if not name.startswith(('Gap', 'Step'))}
-    grounds = ((mixed.type.replace('mixed', 'walls'), walls), (mixed.type, near))
-    return evenly(
-        [*({'terrain': {'Type': type_, 'Params': [values]}} for type_, values in grounds), {}]
-    )
+    grounds = (ground_of(preset, near, walls=walls) for walls in (True, False))
+    return evenly([*({'terrain': ground} for ground in grounds), {}])
 
 
-def with_walls(preset: str) -> tuple[Any, ...]:
+def with_walls(preset: str) -> Stages:
     """Returns a stage in which half of the simulations have only the walls of a mixed preset."""
-    mixed = terrain.load(preset)
-    walls = {
-        name: value
-        for name, value in mixed.parameter_sets[0].items()
-        if not name.startswith(('Gap', 'Step'))
-    }
-    ground = {'Type': mixed.type.replace('mixed', 'walls'), 'Params': [walls]}
+    ground = ground_of(preset, dict(terrain.load(preset).parameter_sets[0]), walls=True)
     return ((0.0, ({}, {'terrain': ground})),)
 
 
-def with_larger(preset: str) -> tuple[Any, ...]:
+def with_larger(preset: str) -> Stages:
     """Returns a stage in which half of the simulations have larger obstacles than a preset's.
 
     Their sizes are from the middle of the preset's range to a tenth more than its largest.
     """
-    ground = terrain.load(preset)
-    values = dict(ground.parameter_sets[0])
+    values = dict(terrain.load(preset).parameter_sets[0])
     for size in ('GapW', 'WallH', 'StepH0', 'StepH1'):
         bounds = f'{size}Min', f'{size}Max'
         if bounds[0] in values:
             small, large = sorted((values[bound] for bound in bounds), key=abs)
             between = sorted(((small + large) / 2, LARGER * large))
             values |= dict(zip(bounds, between, strict=True))
-    return ((0.0, ({}, {'terrain': {'Type': ground.type, 'Params': [values]}})),)
+    return ((0.0, ({}, {'terrain': ground_of(preset, values)})),)
 
 
-def evenly(stages: Iterable[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
-    """Returns curriculum stages of equal length."""
-    listed = list(stages)
-    return tuple((i / len(listed), options) for i, options in enumerate(listed))
+# Footsteps.
 
 
-def joined(*parts: tuple[tuple[float, dict[str, Any]], ...]) -> tuple[Any, ...]:
-    """Returns curriculum stages one after the other, of equal length.
-
-    All parts but the last are without their last stage, which is the preset.
-    """
-    *first, last = parts
-    return evenly(options for part in (*(p[:-1] for p in first), last) for _, options in part)
+def pushes(least: float, largest: float, *interval: float) -> dict[str, tuple[float, ...]]:
+    return {'force': (least, largest), 'duration': (0.2, 0.2), 'interval': interval or (2.0, 4.0)}
 
 
-# Differences from the defaults.
-RUNS = {'least_share': {'com': 0.37}}  # a speed error of about 1 m/s
-RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
-# Footsteps: an even walk first, then all step lengths and widths and plans like those of a
-# high-level controller, then sharp turns and pushes. The reward weighs accuracy more than in
-# evaluations, and a large landing error ends the episode, because samples far behind the plan are
-# not useful. In the next stages it does not, and the walker may leave the plan to keep its balance
-# after a push. Then it has to return to the plan, with a reward that extends far enough for that,
-# and to be accurate again. Later a large landing error ends the episode except in the two seconds
-# after a push or a sharp turn; otherwise the walker drifts off the plan. The last stages contain
-# stopping and turning about, which high-level controllers need.
-WALKER = 37e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
-STAGES = (
-    (0.0, {
-        'footstep_scale': 3.0, 'heading_scale': 2.0, 'max_landing_error': 0.5,
-        'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
-    }),
-    (0.9e6 / WALKER, {
-        'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.5,
-        'plans': {**VARIED, 'sharp': 0.03},
-    }),
-    (2.1e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 3.0, 'max_landing_error': 0.6,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (6e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 5.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
-    }),
-    (9e6 / WALKER, {
-        'footstep_scale': 3.0, 'heading_scale': 5.0, 'max_landing_error': 0.8,
-        'plans': {**VARIED, 'sharp': 0.05},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (10e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 5.0, 'max_landing_error': 0.6,
-        'plans': {**VARIED, 'sharp': 0.05},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (12e6 / WALKER, {
-        'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (15e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 3.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (18e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 4.0, 'max_landing_error': 0.5, 'grace_period': 2.0,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (19.3e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 4.0, 'max_landing_error': 0.35, 'grace_period': 1.5,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
-    }),
-    (21e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 3.0, 'max_landing_error': 0.5, 'grace_period': 2.5,
-        'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (23e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (25e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.3, 'grace_period': 2.5,
-        'plans': {**VARIED, 'change': 0.2, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
-    }),
-    (27e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
-        'plans': {
-            **VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2, 'sharp': 0.06,
-        },
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
-    }),
-    (33e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
-        'plans': {
-            **VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2, 'sharp': 0.08,
-            'from_root': 0.5, 'root_turn': 0.6,
-        },
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
-    }),
+TO_REST = {**VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2}
+# An even walk first, then all step lengths and widths and plans like those of a high-level
+# controller, then sharp turns and pushes. The reward weighs accuracy more than in evaluations, and a
+# large landing error ends the episode, because samples far behind the plan are not useful. In the
+# next stages it does not, and the walker may leave the plan to keep its balance after a push. Then it
+# has to return to the plan, with a reward that extends far enough for that, and to be accurate again.
+# Later a large landing error ends the episode except in the two seconds after a push or a sharp turn;
+# otherwise the walker drifts off the plan. The last stages contain stopping and turning about, which
+# high-level controllers need.
+COLUMNS = 'footstep_scale', 'heading_scale', 'max_landing_error', 'grace_period', 'plans', 'pushes'
+WALKER = 37e6  # samples
+STAGES: Stages = tuple(
+    (begin / WALKER, {n: v for n, v in zip(COLUMNS, values, strict=True) if v is not None})
+    for begin, *values in (
+        (0.0, 3.0, 2.0, 0.5, None, {'length': (0.4, 0.6), 'sharp': 0.0}, None),
+        (0.9e6, 5.0, 3.0, 0.5, None, {**VARIED, 'sharp': 0.03}, None),
+        (2.1e6, 10.0, 3.0, 0.6, None, {**VARIED, 'sharp': 0.1}, pushes(50, 180, 1.5, 4)),
+        (6e6, 8.0, 5.0, None, None, {**VARIED, 'sharp': 0.1}, pushes(80, 220, 1, 3)),
+        (9e6, 3.0, 5.0, 0.8, None, {**VARIED, 'sharp': 0.05}, pushes(80, 200, 1.5, 4)),
+        (10e6, 8.0, 5.0, 0.6, None, {**VARIED, 'sharp': 0.05}, pushes(80, 180, 1.5, 4)),
+        (12e6, (1.5, 20.0), 5.0, None, None, {**VARIED, 'sharp': 0.1}, pushes(80, 200, 1.5, 4)),
+        (15e6, 8.0, 3.0, None, None, {**VARIED, 'sharp': 0.1}, pushes(80, 200, 1.5, 4)),
+        (18e6, 10.0, 4.0, 0.5, 2.0, {**VARIED, 'change': 0.5, 'sharp': 0.1}, pushes(80, 180, 2.5, 5)),
+        (19.3e6, 15.0, 4.0, 0.35, 1.5, {**VARIED, 'change': 0.5, 'sharp': 0.06}, pushes(80, 180, 3, 8)),
+        (21e6, 15.0, 3.0, 0.5, 2.5, {**VARIED, 'change': 0.3, 'sharp': 0.06}, pushes(100, 180, 2.5, 5)),
+        (23e6, 20.0, 3.0, 0.35, 2.5, {**VARIED, 'change': 0.5, 'sharp': 0.06}, pushes(100, 180, 2.5, 5)),
+        (25e6, 20.0, 3.0, 0.3, 2.5, {**VARIED, 'change': 0.2, 'sharp': 0.06}, pushes(100, 180, 3, 6)),
+        (27e6, 20.0, 3.0, 0.35, 2.5, {**TO_REST, 'sharp': 0.06}, pushes(100, 180, 3, 6)),
+        (33e6, 20.0, 3.0, 0.35, 2.5, {**TO_REST, 'sharp': 0.08, 'from_root': 0.5, 'root_turn': 0.6},
+         pushes(100, 180, 3, 6)),
+    )
 )  # fmt: skip
-
-
-def pushes(least: float, largest: float) -> dict[str, tuple[float, float]]:
-    return {'force': (least, largest), 'duration': (0.2, 0.2), 'interval': (2.0, 4.0)}
-
 
 # After these stages everything at the same time, in equal numbers of simulations, with a cost of
 # landing errors. What only few simulations contain is forgotten, so sharp turns and pushes are part
@@ -294,15 +236,19 @@ CONDITIONS: tuple[dict[str, Any], ...] = (
     {**PLACES, 'terrain': ramp(0.08)},
     {**PLACES, 'terrain': bumps(0.06)},
 )
-EVEN = {'length': (0.25, 0.75), 'change': 0.0, 'turn': 0.0, 'sharp': 0.02}
+EVEN = {'plans': {'length': (0.25, 0.75), 'change': 0.0, 'turn': 0.0, 'sharp': 0.02}}
 
 
-def together(conditions: Iterable[dict[str, Any]], **options: Any) -> tuple[Any, ...]:
+def together(conditions: Iterable[dict[str, Any]], **options: Any) -> Stages:
     """Returns a stage with all conditions at the same time, and further options in all of them."""
     common = {'max_landing_error': 0.6, 'grace_period': 2.5, **options}
     return ((0.0, tuple({**common, **own} for own in conditions)),)
 
 
+# Parts of rows of the table below, differences from the defaults of `Settings`.
+RUNS = {'least_share': {'com': 0.37}}  # a speed error of about 1 m/s
+RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
+ENOUGH = {'enough': 0.95}
 ACCURATELY = {
     'samples': 8e6, 'num_envs': 260, 'minibatch': 1024, 'learning_rate': 1.5e-4,
     'last_learning_rate': 2e-5, 'start_count': 1e9, 'value_first': 3e5, 'value_rate': 1e-3,
@@ -314,7 +260,7 @@ MORE_ACCURATELY = {
     **ACCURATELY, 'samples': 6e6, 'num_envs': 264, 'gamma': 0.98,
     'landing_costs': {'landing_error': 30.0, 'heading_error': 6.0},
     'stages': together(
-        (*CONDITIONS[:4], {'plans': EVEN}, *CONDITIONS[4:]), footstep_scale=15.0, heading_scale=3.0
+        (*CONDITIONS[:4], EVEN, *CONDITIONS[4:]), footstep_scale=15.0, heading_scale=3.0
     ),
 }  # fmt: skip
 # After stronger pushes a landing error is no failure; more simulations turn about and stand on belts.
@@ -324,38 +270,20 @@ MORE_STABLY = {
     'landing_costs': {'landing_error': 25.0, 'heading_error': 6.0},
     'stages': together(
         (
-            *CONDITIONS[:4], {'plans': EVEN}, *CONDITIONS[4:6],
+            *CONDITIONS[:4], EVEN, *CONDITIONS[4:6],
             {'plans': {**BY_ROOT, 'root_turn': 0.6}, 'pushes': pushes(60, 160)},
-            {**STRONG, 'plans': {'sharp': 0.03}},
-            {**STRONG, 'plans': FREE},
+            {**STRONG, 'plans': {'sharp': 0.03}}, {**STRONG, 'plans': FREE},
             {**STRONG, 'plans': {'sharp': 0.05}, 'pushes': pushes(100, 250)},
             *CONDITIONS[7:], {'plans': {'sharp': 0.03}, 'terrain': BELTS},
         ),
         footstep_scale=15.0, heading_scale=3.0,
     ),
 }  # fmt: skip
-# Running: the environment's plan first, then other lengths and gentle turns, then plans from the
-# root.
-RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
-RUN_STAGES = (
-    (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'max_landing_error': 0.8}),
-    (0.25, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'max_landing_error': 0.8,
-        'plans': {**RUN_PLANS, 'turn': 0.15},
-    }),
-    (0.5, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'max_landing_error': 0.8,
-        'plans': {
-            **RUN_PLANS, 'length': (0.8, 1.3), 'turn': 0.25, 'from_root': 0.3,
-            'root_length': (0.8, 1.3), 'root_width': (0.08, 0.25), 'root_turn': 0.25,
-        },
-    }),
-)  # fmt: skip
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
-ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),)
 STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
-    **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    **FOOTSTEPS, 'samples': 1e6, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'stages': ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),),
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
 # Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
@@ -371,31 +299,45 @@ ON_TRAILS = {
 # alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its
 # longer steps does.
 PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
-PLANAR_STAGES = (
-    (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
-    (0.2, {'footstep_scale': 5.0, 'max_landing_error': 0.3, 'plans': PLANAR_PLANS}),
-    (0.45, {'footstep_scale': 10.0, 'max_landing_error': 0.2, 'plans': PLANAR_PLANS}),
-)  # fmt: skip
 PLANAR_STEPS = {
-    'samples': 0.8e6, 'gamma': 0.97, 'stages': PLANAR_STAGES, 'start': 'PD_Biped2D_Flat-v0',
+    'samples': 0.8e6, 'gamma': 0.97, 'start': 'PD_Biped2D_Flat-v0',
+    'stages': (
+        (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
+        (0.2, {'footstep_scale': 5.0, 'max_landing_error': 0.3, 'plans': PLANAR_PLANS}),
+        (0.45, {'footstep_scale': 10.0, 'max_landing_error': 0.2, 'plans': PLANAR_PLANS}),
+    ),
 }  # fmt: skip
-RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'stages': RUN_STAGES, **RUNS}
+# Running: the environment's plan first, then other lengths and gentle turns, then plans from the root.
+RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
+RUN_FAR = {'heading_scale': 2.0, 'max_landing_error': 0.8}
+RUN_STEPS = {
+    **FOOTSTEPS, **RUNS, 'samples': 5e6,
+    'stages': (
+        (0.0, {'footstep_scale': 2.0, **RUN_FAR}),
+        (0.25, {'footstep_scale': 4.0, **RUN_FAR, 'plans': {**RUN_PLANS, 'turn': 0.15}}),
+        (0.5, {'footstep_scale': 4.0, **RUN_FAR, 'plans': {
+            **RUN_PLANS, 'length': (0.8, 1.3), 'turn': 0.25, 'from_root': 0.3,
+            'root_length': (0.8, 1.3), 'root_width': (0.08, 0.25), 'root_turn': 0.25,
+        }}),
+    ),
+}  # fmt: skip
 PLANS = {  # a step is a whole footstep, so there are few samples
     'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
     'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('goal',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
-# Policy updates stop after a few steps, too few to train the value network.
-BETTER_VALUED = {'value_goes_on': True, 'learning_rate': 1e-4}
-# Imitation of an expert with a map, by DAgger; then PPO.
+# Imitation of an expert with a map, by DAgger; then PPO, whose updates stop after a few steps, too few
+# to train the value network.
 GUIDED = {
-    **BETTER_VALUED, 'samples': 2e5, 'start': 'expert', 'cloned': 1.2e5, 'clonings': 6,
-    'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
-    'evaluation_episodes': 32,
+    'samples': 2e5, 'start': 'expert', 'cloned': 1.2e5, 'clonings': 6, 'value_first': 1.4e5,
+    'value_goes_on': True, 'learning_rate': 1e-4, 'map_bound': 0.3, 'averaged': 2e4,
+    'evaluate_every': 2e4, 'evaluation_episodes': 32,
 }  # fmt: skip
 # With more data and a larger network imitation alone comes close to its expert.
-IMITATING = {**GUIDED, 'hidden': (512, 256), 'cloning_epochs': 20}
-AMONG_BLOCKS = {**IMITATING, 'samples': 3.6e5, 'cloned': 3.6e5, 'evaluation_episodes': 64}
+AMONG_BLOCKS = {
+    **GUIDED, 'hidden': (512, 256), 'cloning_epochs': 20, 'samples': 3.6e5, 'cloned': 3.6e5,
+    'evaluation_episodes': 64,
+}  # fmt: skip
 AMONG_PILLARS = {**AMONG_BLOCKS, 'samples': 3e5, 'cloned': 3e5, 'clonings': 5}
 # Convolutions over the maps, ReLU and a falling learning rate follow the expert more closely.
 SEEING = {
@@ -404,27 +346,27 @@ SEEING = {
     'last_cloning_rate': 2e-5, 'averaged': 0.0,
 }  # fmt: skip
 ON_A_TRAIL = {**SEEING, 'samples': 2.4e5, 'cloned': 2.4e5}
-MOVING = {**GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8}  # m/s
 AMONG_MOVING = {
     **SEEING, 'samples': 3.2e5, 'cloned': 3.2e5, 'map_bound': 1.0, 'view': (6.0, 3.6),
-    'further': (
-        {
-            'samples': 1.6e5, 'cloned': 1.6e5, 'clonings': 2, 'imitates_again': True,
-            'start_count': 1e9, 'cloning_rate': 3e-4,
-        },
-    ),
+    'further': ({
+        'samples': 1.6e5, 'cloned': 1.6e5, 'clonings': 2, 'imitates_again': True,
+        'start_count': 1e9, 'cloning_rate': 3e-4,
+    },),
 }  # fmt: skip
-ON_BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
-# A goal so large that a kicked ball comes to rest in it, then smaller goals.
+ON_BELTS = {  # maps have velocities, m/s
+    **GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8, 'samples': 1.2e5, 'cloned': 6e4,
+    'value_first': 8e4,
+}  # fmt: skip
 DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
     'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
+    # A goal so large that a kicked ball comes to rest in it, then smaller goals.
     'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
-}  # fmt: skip
-# After the footstep controller was trained further.
-ABOVE_ANOTHER = {
-    'samples': 3.2e5, 'num_envs': 128, 'minibatch': 512, 'last_learning_rate': 3e-5, 'stages': (),
-    'start_count': 1e6, 'value_first': 2e4, 'value_rate': 1e-3, 'evaluate_every': 8e4,
+    'further': ({  # after the footstep controller was trained further
+        'samples': 3.2e5, 'num_envs': 128, 'minibatch': 512, 'last_learning_rate': 3e-5,
+        'stages': (), 'start_count': 1e6, 'value_first': 2e4, 'value_rate': 1e-3,
+        'evaluate_every': 8e4,
+    },),
 }  # fmt: skip
 CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
@@ -449,20 +391,19 @@ MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
 WALLS_AGAIN = {**AGAIN, 'samples': 2e6, 'stages': with_walls('mixed_humanoid')}
 WALLS_ON_SLOPES_AGAIN = {**AGAIN, 'stages': with_walls('slopes_mixed_humanoid')}
 LARGER_WALLS = {**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid')}
-# With this discount a policy learns to step in place in front of a wall, unless that ends the
-# episode.
+LARGER_GAPS = with_larger('gaps_humanoid')
+# With this discount a policy learns to step in place in front of a wall, unless that ends the episode.
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
-ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
-# The same tasks without hierarchy: PPO from the walk, for comparison (`compare_hierarchy.py`).
+# Tasks without hierarchy: PPO from the walk, for comparison (`compare.py`).
 FROM_A_WALK = {
     'num_envs': 64, 'hidden': (256, 256), 'activation': 'tanh', 'convolutions': (), 'gamma': 0.97,
     'view': (6.0, 3.0), 'map_bound': 0.3, 'places': (), 'start': 'PD_Biped3D_Imitate-v0',
     'start_count': 1e6, 'value_goes_on': True, 'learning_rate': 2e-4, 'initial_std': 0.15,
     'step_limit': 0,
 }  # fmt: skip
-# The shipped policies imitate planned footsteps and the controller that tracks them, by DAgger in
-# episodes of a minute, without PPO.
+# The shipped ones imitate planned footsteps and the controller that tracks them, by DAgger in episodes
+# of a minute, without PPO.
 DIRECT = {
     'samples': 8e5, 'start': 'joint_expert', 'cloned': 8e5, 'clonings': 5, 'cloning_epochs': 6,
     'last_cloning_rate': 2e-5, 'num_envs': 128, 'step_limit': 1800, 'hidden': (512, 256),
@@ -470,10 +411,20 @@ DIRECT = {
     'map_bound': 0.3, 'places': ('goal',), 'initial_std': 0.08, 'gamma': 0.97, 'start_count': 1e6,
     'value_goes_on': True, 'learning_rate': 2e-4, 'evaluate_every': 2e5,
 }  # fmt: skip
-DIRECT_DRIBBLING = {'convolutions': (), 'view': None, 'map_bound': 0.0, 'places': ('goal', 'ball')}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
-# By the pattern of an id; later entries have precedence.
-OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
+
+
+def from_flat(name: str) -> tuple[Row, ...]:
+    """Returns the rows of a character that goes from flat ground to all other terrains."""
+    onto = {'samples': 0.6e6, 'start': f'PD_{name}_Flat_Terrain-v0', **ENOUGH}
+    return (
+        (f'PD_{name}_*_Terrain-v0', onto),
+        (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
+    )
+
+
+# The table: pattern of ids -> differences from the defaults; later rows have precedence.
+OVERRIDES: tuple[Row, ...] = (
     ('*', {'samples': 0.8e6}),
     ('*_Biped2D_*Flat-v0', {'samples': 0.5e6}),
     ('*_Run_*', {'samples': 1e6, **RUNS, **ENOUGH}),
@@ -484,19 +435,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
-    # From flat ground to all other terrains.
     ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0', **ENOUGH}),
-    *(
-        row
-        for name in ('Dog2D', 'Raptor2D')
-        for row in (
-            (
-                f'PD_{name}_*_Terrain-v0',
-                {'samples': 0.6e6, 'start': f'PD_{name}_Flat_Terrain-v0', **ENOUGH},
-            ),
-            (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
-        )
-    ),
+    *from_flat('Dog2D'), *from_flat('Raptor2D'),
     ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
     # From one kind of obstacle to mixed terrain, and from there to mixed terrain on slopes.
     *(
@@ -511,75 +451,34 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Dog2D_Gaps_Terrain-v0', {**LONGER, 'samples': 3e6}),
     # Walls alone make dog and raptor forget gaps.
     ('PD_*2D_Mixed_Terrain-v0', {**LONG, 'stages': joined(HIGHER, crowded('mixed_humanoid')[1:])}),
-    (
-        'PD_*2D_Slopes_Mixed_Terrain-v0',
-        {**LONG, 'stages': joined(crowded('slopes_mixed_humanoid')[1:])},
-    ),
-    (
-        'PD_Raptor2D_Mixed_Terrain-v0',
-        {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER},
-    ),
+    ('PD_*2D_Slopes_Mixed_Terrain-v0',
+     {**LONG, 'stages': joined(crowded('slopes_mixed_humanoid')[1:])}),
     # After these runs nine of ten falls of dog and raptor are at walls.
-    (
-        'PD_Dog2D_Mixed_Terrain-v0',
-        {'further': (MORE_WALLS, WALLS_AGAIN, {**WALLS_AGAIN, 'samples': 3e6})},
-    ),
-    ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
-    (
-        'PD_Dog2D_Slopes_Mixed_Terrain-v0',
-        {
-            **MORE_WALLS_ON_SLOPES,
-            'samples': 2e6,
-            'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 4e6}, WALLS_ON_SLOPES_AGAIN),
-        },
-    ),
-    (
-        'PD_Raptor2D_Slopes_Mixed_Terrain-v0',
-        {
-            **MORE_WALLS_ON_SLOPES,
-            'samples': 4e6,
-            'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 2e6},),
-        },
-    ),
+    ('PD_Dog2D_Mixed_Terrain-v0',
+     {'further': (MORE_WALLS, WALLS_AGAIN, {**WALLS_AGAIN, 'samples': 3e6})}),
+    ('PD_Raptor2D_Mixed_Terrain-v0',
+     {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER, 'further': (MORE_WALLS,)}),
+    ('PD_Dog2D_Slopes_Mixed_Terrain-v0',
+     {**MORE_WALLS_ON_SLOPES, 'samples': 2e6,
+      'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 4e6}, WALLS_ON_SLOPES_AGAIN)}),
+    ('PD_Raptor2D_Slopes_Mixed_Terrain-v0',
+     {**MORE_WALLS_ON_SLOPES, 'samples': 4e6, 'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 2e6},)}),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
     # After the runs before, falls are at the highest walls and the widest gaps.
     ('PD_Dog2D_Walls_Terrain-v0', {'further': (LARGER_WALLS,)}),
     ('PD_Biped2D_Walls_Terrain-v0', {'further': ({**LARGER_WALLS, 'gamma': 0.98},)}),
-    (
-        'PD_Dog2D_Gaps_Terrain-v0',
-        {
-            'further': tuple(
-                {**own, 'stages': with_larger('gaps_humanoid')} for own in (MORE, AGAIN)
-            )
-        },
-    ),
-    (
-        'PD_Raptor2D_Gaps_Terrain-v0',
-        {'further': ({**AGAIN, 'stages': with_larger('gaps_humanoid')},)},
-    ),
+    ('PD_Dog2D_Gaps_Terrain-v0',
+     {'further': ({**MORE, 'stages': LARGER_GAPS}, {**AGAIN, 'stages': LARGER_GAPS})}),
+    ('PD_Raptor2D_Gaps_Terrain-v0', {'further': ({**AGAIN, 'stages': LARGER_GAPS},)}),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
-    (
-        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
-        {
-            'further': (
-                {
-                    **AGAIN,
-                    'samples': 4e6,
-                    'gamma': 0.98,
-                    'stages': with_larger('slopes_mixed_humanoid'),
-                },
-                {**WALLS_ON_SLOPES_AGAIN, 'gamma': 0.98},
-            )
-        },
-    ),
-    (
-        'PD_Biped2D_Mixed_Terrain-v0',
-        {
-            'samples': 8e6,
-            'stages': joined(HIGHER, crowded('mixed_humanoid')),
-            'further': ({**AGAIN, 'samples': 2e6, 'gamma': 0.98, 'stages': ()},),
-        },
-    ),
+    ('PD_Biped2D_Slopes_Mixed_Terrain-v0',
+     {'further': (
+         {**AGAIN, 'samples': 4e6, 'gamma': 0.98, 'stages': with_larger('slopes_mixed_humanoid')},
+         {**WALLS_ON_SLOPES_AGAIN, 'gamma': 0.98},
+     )}),
+    ('PD_Biped2D_Mixed_Terrain-v0',
+     {'samples': 8e6, 'stages': joined(HIGHER, crowded('mixed_humanoid')),
+      'further': ({**AGAIN, 'samples': 2e6, 'gamma': 0.98, 'stages': ()},)}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
@@ -590,14 +489,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    (
-        'PD_Biped3D_LLC_General_Step-v0',
-        {
-            'stages_averaged': 2,
-            'further': (ACCURATELY, MORE_ACCURATELY, MORE_STABLY),
-            'runs_averaged': 2,
-        },
-    ),
+    ('PD_Biped3D_LLC_General_Step-v0',
+     {'stages_averaged': 2, 'further': (ACCURATELY, MORE_ACCURATELY, MORE_STABLY), 'runs_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     ('PD_Biped3D_LLC_Bumps_Step-v0', STEPS_ON),
     ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
@@ -605,7 +498,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', DIRECT),
-    ('PD_Biped3D_Terrain_Soccer_Hard-v0', DIRECT_DRIBBLING),
+    ('PD_Biped3D_Terrain_Soccer_Hard-v0',
+     {'convolutions': (), 'view': None, 'map_bound': 0.0, 'places': ('goal', 'ball')}),
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_LargeBlocks-v0', AMONG_BLOCKS),
     ('PD_Biped3D_HLC_Forest-v0', AMONG_PILLARS),
@@ -613,10 +507,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_HLC_Conveyors*', ON_BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
     ('PD_Biped3D_HLC_PathFollowing-v0', ON_A_TRAIL),
-    ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (ABOVE_ANOTHER,)}),
+    ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
-)
+)  # fmt: skip
 
 # Policies for worlds and sensors that vary, in `trained/randomized`: `train_randomized.py` continues
 # the training of shipped ones with this preset of `randomize` and `sensors`. Low learning rates, to
@@ -641,8 +535,8 @@ RANDOMIZED: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
-    """Returns the values of all entries that match an id; later entries have precedence."""
+def matching(id_: str, rows: Iterable[Row]) -> dict[str, Any]:
+    """Returns the values of all rows that match an id; later rows have precedence."""
     values: dict[str, Any] = {}
     for pattern, row in rows:
         if fnmatch.fnmatchcase(id_, pattern):

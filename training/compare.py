@@ -1,0 +1,304 @@
+"""Comparisons of trainings for the pages of the documentation: of actions, hierarchy and torque limits.
+
+    python training/compare.py actions --seeds 1 2 3 --json docs/data/gait_actions.json
+    python training/compare.py hierarchy --seeds 1 2 3 --json docs/data/hierarchy.json \
+        --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
+    python training/compare.py limits --seeds 1 2 3 --samples 1e6 --page docs/realism.md
+
+`actions`: base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
+`hierarchy`: as Figure 9 of Peng et al. (2017), footstep planning above a trained controller, and control
+without hierarchy that starts from a walk, with the same number of control steps; no demonstrations,
+curricula or averages of weights. `limits`: actuation models of the biped, trained and evaluated with
+realistic torque limits.
+
+Every result is a training with the same number of samples and an evaluation. Finished ones are kept in
+the JSON file, and not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import evaluate_plans
+import learn_gaits
+import numpy as np
+import pages
+import ppo
+import settings
+import torch
+import tqdm
+
+from trl_suite import evaluation, policies, suite
+from trl_suite.tasks.task import CONTROL_TIMESTEP
+from trl_suite.util import files
+from trl_suite.util.program import begin_script
+
+SEED = 0  # of evaluations
+Results = dict[str, Any]  # 'CELL/SEED' -> result
+
+
+class Comparison(NamedTuple):
+    """What is compared.
+
+    Attributes:
+      samples: of each training, by default.
+      cells: what is trained with each seed.
+      job: (cell, seed, samples, folder) -> result.
+      table: (results, seeds) -> Markdown.
+      panels: results -> learning curves, see `pages.curves`.
+      axis: their x axis.
+    """
+
+    samples: float
+    cells: tuple[str, ...]
+    job: Callable[[str, int, float, pathlib.Path], Any]
+    table: Callable[[Results, list[int]], str]
+    panels: Callable[[Results], dict[str, dict[str, list[Any]]]]
+    axis: str
+
+
+def of(results: Results, cell: str) -> dict[int, Any]:
+    """Returns the results of a cell by seed."""
+    pairs = (key.rsplit('/', 1) for key in results)
+    return {int(seed): results[f'{cell}/{seed}'] for name, seed in pairs if name == cell}
+
+
+# Actions of gaits.
+
+DOG, ACTION_EPISODES = 'FSM_Dog2D_Terrain_Mixed-v0', 100
+ACTIONS = {
+    'discrete': 'one of the base actions', 'continuous': 'default gait with changes',
+    'both': 'base action with changes (MACE)', 'ppo': 'default gait with changes, PPO',
+}  # fmt: skip
+
+
+def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -> dict[str, Any]:
+    """Trains with random first actions instead of those of a shipped policy."""
+    common: dict[str, Any] = {'samples': cycles, 'evaluate_every': cycles / 4}
+    if action == 'ppo':
+        curve = ppo.train(DOG, seed, settings.settings_for(DOG, **common), folder, 1)
+    else:
+        own = learn_gaits.Settings(action=action, expert_cycles=0, evaluation_episodes=0, **common)
+        curve = learn_gaits.train(DOG, seed, own, folder, 1)
+    found = evaluation.evaluate(DOG, policies.load(folder / 'policy.npz'), ACTION_EPISODES, SEED, 1)
+    keys = 'distance', 'distance_interval', 'median_distance', 'speed'
+    points = [[point['samples'], point['distance']] for point in curve if 'distance' in point]
+    return {**{key: found[key] for key in keys}, 'curve': points}
+
+
+def action_table(results: Results, seeds: list[int]) -> str:
+    rows = []
+    for action, name in ACTIONS.items():
+        if done := of(results, action):
+            distances = [f'{done[seed]["distance"]:.0f}' if seed in done else '–' for seed in seeds]
+            mean, speed = (
+                np.mean([each[k] for each in done.values()]) for k in ('distance', 'speed')
+            )
+            rows.append([name, *distances, f'{mean:.0f}', f'{speed:.1f}'])
+    title = f'Distance to the first fall in `{DOG}`, mean of {ACTION_EPISODES} episodes, m:'
+    head = ['action', *(f'seed {seed}' for seed in seeds), 'mean', 'speed, m/s']
+    return f'{title}\n\n{pages.table(head, rows)}'
+
+
+def action_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
+    def curve(result: dict[str, Any]) -> np.ndarray:
+        last = [result['curve'][-1][0], result['distance']]  # of the final policy
+        return np.array([*result['curve'], last]) * (1e-3, 1)
+
+    found = {name: list(map(curve, of(results, each).values())) for each, name in ACTIONS.items()}
+    return {'distance to the first fall, m': found}
+
+
+# Hierarchy.
+
+TASKS = {  # with and without hierarchy; what counts: key, factor and label
+    'trail': ('PD_Biped3D_HLC_PathFollowing-v0', 'PD_Biped3D_Terrain_Trail_Hard-v0',
+              'trail', 1, 'median distance along the trail in 200 s, m'),
+    'soccer': ('PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_Terrain_Soccer_Hard-v0',
+               'at_goal', 100, 'time with the ball at its goal, %'),
+}  # fmt: skip
+KINDS = ('with hierarchy', 'without')
+SCRATCH: dict[str, Any] = {'stages': (), 'averaged': 0.0, 'stages_averaged': 1}
+OWN: tuple[dict[str, Any], ...] = (
+    {'start': '', 'activation': 'tanh', 'convolutions': ()}, settings.FROM_A_WALK,
+)  # fmt: skip
+QUARTERS, HIERARCHY_EPISODES = 4, 32
+
+
+def train_hierarchy(
+    cell: str, seed: int, control_steps: float, folder: pathlib.Path
+) -> list[dict[str, Any]]:
+    """Trains, and evaluates the policy after every quarter of the control steps of 1/30 s."""
+    task, kind = cell.split('/')
+    id_, own = TASKS[task][KINDS.index(kind)], OWN[KINDS.index(kind)]
+    each = suite.make(id_).control_timestep() / CONTROL_TIMESTEP  # control steps of a sample
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer = ppo.Trainer(
+        id_, seed, settings.settings_for(id_, **SCRATCH, **own, samples=control_steps / each), 1
+    )
+    result = []
+    for i in range(QUARTERS):
+        while trainer.samples * each < control_steps * (i + 1) / QUARTERS:
+            trainer.learn(trainer.collect())
+        policy = trainer.exported()
+        policies.save(policy, folder / f'quarter_{i + 1}.npz')
+        found = evaluate_plans.run(id_, lambda _, p=policy: p, HIERARCHY_EPISODES, SEED)
+        result.append({'control_steps': round(trainer.samples * each), **found})
+    trainer.environments.close()
+    return result
+
+
+def hierarchy_table(results: Results, seeds: list[int]) -> str:
+    rows = []
+    for task, (*_, name, factor, label) in TASKS.items():
+        for kind in KINDS:
+            done = {seed: run[-1] for seed, run in of(results, f'{task}/{kind}').items()}
+            if done:
+                cells = [f'{factor * done[s][name]:.1f}' if s in done else '–' for s in seeds]
+                mean = factor * np.mean([last[name] for last in done.values()])
+                minute = np.mean([last['survived_minute'] for last in done.values()])
+                rows.append([f'{task}, {kind}: {label}', *cells, f'{mean:.1f}', f'{minute:.0%}'])
+    head = ['task', *(f'seed {seed}' for seed in seeds), 'mean', 'no fall in a minute']
+    return f'{HIERARCHY_EPISODES} episodes of 200 s:\n\n{pages.table(head, rows)}'
+
+
+def hierarchy_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
+    return {
+        f'{task}: {label}': {
+            kind: [
+                [[point['control_steps'] / 1e6, factor * point[name]] for point in run]
+                for run in of(results, f'{task}/{kind}').values()
+            ]
+            for kind in KINDS
+        }
+        for task, (*_, name, factor, label) in TASKS.items()
+    }
+
+
+# Torque limits.
+
+MODELS = {'position': 'PD', 'torque': 'Torque', 'velocity': 'Vel', 'muscle': 'MTU'}
+REAL = {'torque_speed': True, 'torque_pose': True}
+LIMITS: dict[str, dict[str, Any]] = {
+    'ideal': {}, 'realistic': REAL, 'realistic, half strength': {**REAL, 'strength': 0.5},
+}  # fmt: skip
+LIMIT_EPISODES = 50
+
+
+def limited(model: str, limits: str) -> dict[str, Any]:
+    """Returns the options of the task; muscles have curves of their own, only their strength differs."""
+    own = LIMITS[limits]
+    if model == 'muscle':
+        own = {name: value for name, value in own.items() if name not in REAL}
+    return {'actuators': own} if own else {}
+
+
+def train_limits(cell: str, seed: int, samples: float, folder: pathlib.Path) -> dict[str, Any]:
+    model, limits = cell.split('/')
+    id_, given = f'{MODELS[model]}_Biped2D_LLC_Imitate_Flat-v0', limited(model, limits)
+    own = settings.settings_for(
+        id_,
+        samples=samples,
+        stages=((0.0, given),),
+        evaluated_with=given,
+        evaluate_every=samples / 5,
+    )
+    curve = ppo.train(id_, seed, own, folder, threads=1, progress=False)
+    policy = policies.load(folder / 'policy.npz')
+    found = evaluation.evaluate(id_, policy, LIMIT_EPISODES, SEED, 1, given)
+    keys = 'return', 'return_interval', 'normalized_return', 'completion_rate', 'distance'
+    points = [[point['samples'], point['normalized_return']] for point in curve]
+    return {**{key: found[key] for key in keys}, 'curve': points}
+
+
+def limit_table(results: Results, seeds: list[int]) -> str:
+    def cell(model: str, limits: str) -> str:
+        done = of(results, f'{model}/{limits}') or (
+            of(results, f'{model}/ideal') if not limited(model, limits) else {}
+        )
+        values = [each['normalized_return'] for each in done.values()]
+        text = f'{np.mean(values):.2f}' if values else '–'
+        return text + (f' ± {np.std(values):.2f}' if len(values) > 1 else '')
+
+    title = f'Return divided by its maximum, mean over {LIMIT_EPISODES} episodes:'
+    rows = ([limits, *(cell(model, limits) for model in MODELS)] for limits in LIMITS)
+    return f'{title}\n\n{pages.table(["torque limits", *MODELS], rows)}'
+
+
+def limit_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
+    return {
+        limits: {
+            model: [
+                np.array(each['curve']) * (1e-6, 1)
+                for each in of(results, f'{model}/{limits}').values()
+            ]
+            for model in MODELS
+        }
+        for limits in LIMITS
+    }
+
+
+COMPARISONS = {
+    'actions': Comparison(
+        32768, tuple(ACTIONS), train_actions, action_table, action_panels, 'cycles, thousand'
+    ),
+    'hierarchy': Comparison(
+        1.2e6, tuple(f'{task}/{kind}' for task in TASKS for kind in KINDS), train_hierarchy,
+        hierarchy_table, hierarchy_panels, 'control steps, million',
+    ),
+    'limits': Comparison(
+        2.5e5,
+        tuple(
+            f'{model}/{limits}' for limits in LIMITS for model in MODELS
+            if limits == 'ideal' or limited(model, limits)
+        ),
+        train_limits, limit_table, limit_panels, 'samples, million',
+    ),
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('comparison', choices=COMPARISONS)
+    parser.add_argument('--seeds', type=int, nargs='+', default=[1])
+    parser.add_argument('--samples', type=float, help='of each training, instead of the default')
+    parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--json', type=pathlib.Path, help='default: RUNS/COMPARISON.json')
+    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
+    parser.add_argument('--picture', type=pathlib.Path, help='a .png for the learning curves')
+    arguments = parser.parse_args()
+    name, compared = arguments.comparison, COMPARISONS[arguments.comparison]
+    samples = arguments.samples or compared.samples
+    path = arguments.json or arguments.runs / f'{name}.json'
+    found: dict[str, Any] = {'samples': samples, 'results': {}}
+    if path.exists():
+        found = json.loads(path.read_text())
+        if found['samples'] != samples:
+            raise ValueError(
+                f'{path}: samples is {found["samples"]}, not {samples}; give another --json'
+            )
+    jobs = [(cell, seed) for seed in arguments.seeds for cell in compared.cells]
+    for cell, seed in tqdm.tqdm(jobs, unit='run'):
+        if f'{cell}/{seed}' not in found['results']:
+            folder = arguments.runs / f'{name}_{samples:g}' / cell / f'seed_{seed}'
+            found['results'][f'{cell}/{seed}'] = compared.job(cell, seed, samples, folder)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with files.replacing(path) as part:
+                part.write_text(json.dumps(found) + '\n')
+    seeds = sorted({int(key.rsplit('/', 1)[1]) for key in found['results']})
+    text = f'After {samples:g} samples, seeds {", ".join(map(str, seeds))}. '
+    print(text := text + compared.table(found['results'], seeds))
+    if arguments.picture is not None:
+        pages.curves(arguments.picture, compared.panels(found['results']), compared.axis)
+    if arguments.page is not None:
+        pages.replace(arguments.page, name, 'compare', text)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()
