@@ -9,6 +9,7 @@ import pathlib
 import re
 import runpy
 import sys
+import tempfile
 import unittest
 from unittest import mock
 
@@ -18,7 +19,7 @@ import pytest
 from absl.testing import absltest, parameterized
 
 import trl_suite.gym
-from trl_suite import suite
+from trl_suite import sequences, suite
 from trl_suite.util import program
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -81,11 +82,29 @@ class GymnasiumTest(absltest.TestCase):
 class StableBaselinesTest(absltest.TestCase):
     @pytest.mark.slow
     def test_example_runs(self):
-        out = output(
-            'stable_baselines_ppo', '--minutes', '1.5', '--every', '4096', '--num_threads', '1'
-        )
+        out = output('stable_baselines_ppo', '--samples', '40960', '--every', '4096')
         returns = [float(line.split()[1]) for line in out.splitlines()[1:]]
         self.assertGreater(max(returns), returns[0] + 4)
+
+    @pytest.mark.slow
+    def test_learners_of_sequences(self):
+        """The second stage of PLAiD takes samples on both terrains."""
+        sequence = sequences.Sequence('two', ('PD_Biped2D_Flat_Terrain-v0', GAPS))
+        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
+        for name, kind, expected in (
+            ('continual_learning', 'FineTuning', [[4096, 0], [0, 4096]]),
+            ('plaid', 'Plaid', [[4096, 0], [320, 2048 + 320]]),
+        ):
+            learner = getattr(load(name), kind)(sequence, 0)
+            found = sequences.run(sequence, learner, 4096, f'{name}.json', episodes=1)
+            self.assertEqual(found['samples'], expected)
+            self.assertGreater(found['scores'][1][0], 0)
+
+
+class ExamplesTest(absltest.TestCase):
+    def test_every_example_is_short(self):
+        for path in EXAMPLES.glob('*.py'):
+            self.assertLessEqual(len(path.read_text().splitlines()), 60, path.name)
 
 
 @needs('torchrl', 'torchrl')
