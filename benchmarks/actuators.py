@@ -1,7 +1,7 @@
 """Costs and effects of the options of actuators, as tables and plots of docs/realism.md.
 
-    python benchmarks/actuators.py costs      # benchmarks/actuators.json: CPU time of each option
-    python benchmarks/actuators.py effects    # benchmarks/actuators.json: returns of shipped policies
+    python benchmarks/actuators.py costs      # docs/data/actuators.json: CPU time of each option
+    python benchmarks/actuators.py effects    # docs/data/actuators.json: returns of shipped policies
     python benchmarks/actuators.py plots      # docs/pictures/realism/actuators.png, by simulation
     python benchmarks/actuators.py page       # the tables of docs/realism.md
 
@@ -10,6 +10,7 @@ them little; environments with and without an option take turns.
 """
 
 import argparse
+import json
 import pathlib
 import time
 
@@ -24,7 +25,7 @@ from trl_suite.util import files, tables
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-RESULTS, PAGE = ROOT / 'benchmarks' / 'actuators.json', ROOT / 'docs' / 'realism.md'
+RESULTS, PAGE = ROOT / 'docs' / 'data' / 'actuators.json', ROOT / 'docs' / 'realism.md'
 PICTURE = ROOT / 'docs' / 'pictures' / 'realism' / 'actuators.png'
 OPTIONS = {
     'torque_speed': {'torque_speed': True},
@@ -71,7 +72,8 @@ def store(name: str, result: object) -> None:
     """Stores results under a name, beside the others."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
     found[name] = result
-    files.write_json(found, RESULTS)
+    with files.replacing(RESULTS) as part:
+        part.write_text(json.dumps(found) + '\n')
 
 
 # Costs.

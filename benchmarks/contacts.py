@@ -1,6 +1,6 @@
 """Measures how feet touch the ground, under changes of contacts, servos, feet and rates.
 
-    python benchmarks/contacts.py [--episodes 8] [--seed 0] [--json benchmarks/contacts.json]
+    python benchmarks/contacts.py [--episodes 8] [--seed 0] [--json docs/data/contacts.json]
         [--page docs/reports/robustness.md]
 
 Shipped policies walk on level ground. In every physics step the normal force of the ground on each foot
@@ -265,7 +265,8 @@ def run(episodes: int, seed: int, path: pathlib.Path) -> dict[str, Any]:
         row = found['results'].setdefault(id_, {})
         if name not in row:
             row[name] = measure(id_, name, episodes, seed)
-            files.write_json(found, path)
+            with files.replacing(path) as part:
+                part.write_text(json.dumps(found) + '\n')
     return found
 
 
@@ -301,7 +302,7 @@ def main() -> None:
     parser.add_argument('--episodes', type=int, default=8)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument(
-        '--json', type=pathlib.Path, default=pathlib.Path('benchmarks/contacts.json')
+        '--json', type=pathlib.Path, default=pathlib.Path('docs/data/contacts.json')
     )
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()

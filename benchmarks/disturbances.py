@@ -1,7 +1,7 @@
 """Measures what worlds that vary, pushes and sensors cost.
 
     python benchmarks/disturbances.py [IDS ...] [--num-envs 64] [--steps 50] [--repeats 5]
-        [--json benchmarks/disturbances.json]
+        [--json docs/data/disturbances.json]
 
 CPU time per step and per reset of one simulation, in microseconds, on one thread: the smallest of
 the repeats, because machines are shared. The actions are zeros; the options are measured in turn.
@@ -10,6 +10,7 @@ the repeats, because machines are shared. The actions are zeros; the options are
 from __future__ import annotations
 
 import argparse
+import json
 import pathlib
 import time
 
@@ -74,7 +75,8 @@ def main() -> None:
         cells = [(name, f'{step:.1f}', f'{reset:.0f}') for name, (step, reset) in found.items()]
         print(id_, tables.table(('options', 'step (us)', 'reset (us)'), cells), sep='\n')
     if arguments.json is not None:
-        files.write_json(figures, arguments.json)
+        with files.replacing(arguments.json) as part:
+            part.write_text(json.dumps(figures) + '\n')
 
 
 if __name__ == '__main__':

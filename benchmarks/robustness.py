@@ -1,7 +1,7 @@
 """Evaluates the shipped policies under each disturbance of world and sensors at three strengths.
 
     python benchmarks/robustness.py [IDS ...] [--episodes 12] [--seeds 0 1] [--step-limit 128]
-        [--json benchmarks/robustness.json] [--page docs/reports/robustness.md]
+        [--json docs/data/robustness.json] [--page docs/reports/robustness.md]
 
 Every cell has the same seeds, so that terrain and start of an episode are the same with and without
 the disturbance. The JSON file is written after every cell, and an unfinished run is resumed. The
@@ -115,7 +115,8 @@ def run(
             name: result[name]
             for name in ('return', 'return_interval', 'completion_rate', 'distance', 'diverged')
         }
-        files.write_json(found, path)
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(found) + '\n')
     return found
 
 
@@ -209,7 +210,7 @@ def main() -> None:
         '--step-limit', type=int, help='of an episode; gaits and planners: an eighth of it'
     )
     parser.add_argument(
-        '--json', type=pathlib.Path, default=pathlib.Path('benchmarks/robustness.json')
+        '--json', type=pathlib.Path, default=pathlib.Path('docs/data/robustness.json')
     )
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()

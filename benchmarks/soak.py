@@ -19,6 +19,7 @@ import argparse
 import ctypes
 import gc
 import importlib.metadata
+import json
 import os
 import pathlib
 import resource
@@ -32,7 +33,7 @@ from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.util import files, program
 from trl_suite.vector import VectorEnvironment
 
-FILE = pathlib.Path(__file__).with_suffix('.json')
+FILE = pathlib.Path(__file__).resolve().parents[1] / 'docs' / 'data' / 'soak.json'
 KINDS = ('uniform', 'changing', 'held', 'huge')
 SPECS = (
     *(suite.find(id_) for id_ in suite.ALL_IDS),
@@ -183,7 +184,8 @@ def main():
             run['environments'] + 1,
         )
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
-        files.write_json(figures, arguments.file)
+        with files.replacing(arguments.file) as part:
+            part.write_text(json.dumps(figures) + '\n')
         bar.set_postfix_str(f'{steps / 1e6:.2f} M control steps, {run["memory"][-1][2]} MB')
         bar.update(min(round(run['seconds']), bar.total) - bar.n)
         if time.time() >= begin + arguments.seconds:

@@ -185,7 +185,7 @@ def main():
             print(f'{name}: {value:.3f} of raw mj_step of its model')
     if arguments.json:
         with open(arguments.json, 'w') as file:
-            json.dump(figures, file, indent=2)
+            json.dump(figures, file)
     if arguments.plot:
         plot(figures, arguments.plot)
 

@@ -59,7 +59,7 @@ WITHOUT = {  # policies shown for environments without a shipped policy
     'zero': 'action 0 in every step, which is the default gait (`--policy zero`)',
 }
 SUBSTEPS = 10  # of a control step in benchmarks/vector_environment.py
-MACHINE = (  # that of benchmarks/vector_environment.json
+MACHINE = (  # that of docs/data/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
@@ -178,7 +178,7 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
 
 EXPERTS = {
     'expert': 'an expert with a map (`training/expert.py`)',
-    'joint_expert': 'planned footsteps and the controller that tracks them (`training/joint_expert.py`)',
+    'joint_expert': 'planned footsteps and the controller that tracks them (`training/expert.py`)',
 }
 
 
@@ -431,7 +431,7 @@ PROJECTED = '1024 simulations, 2 threads'
 
 
 def speeds() -> dict[str, Any]:
-    path = DOCS.parent / 'benchmarks' / 'vector_environment.json'
+    path = DOCS / 'data' / 'vector_environment.json'
     return json.loads(path.read_text(encoding='utf-8'))
 
 
@@ -459,8 +459,8 @@ def filled(path: str, tables: dict[str, str]) -> str:
 
 
 def cost() -> str:
-    """Returns what worlds and sensors cost, from benchmarks/disturbances.json."""
-    path = DOCS.parent / 'benchmarks/disturbances.json'
+    """Returns what worlds and sensors cost, from docs/data/disturbances.json."""
+    path = DOCS / 'data' / 'disturbances.json'
     if not path.exists():
         return ''
     found = json.loads(path.read_text())
@@ -545,7 +545,7 @@ def speed_page() -> str:
         '## Other libraries',
         'Ratios to raw `mj_step` with their own models, in the same run; none of them has terrain.',
         table(('', 'ratio'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
-        'All figures: [vector_environment.json](../benchmarks/vector_environment.json).',
+        'All figures: [vector_environment.json](data/vector_environment.json).',
     )  # fmt: skip
 
 
