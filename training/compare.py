@@ -3,7 +3,7 @@
     python training/compare.py actions --seeds 1 2 3 --json docs/data/gait_actions.json
     python training/compare.py hierarchy --seeds 1 2 3 --json docs/data/hierarchy.json \
         --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
-    python training/compare.py limits --seeds 1 2 3 --samples 1e6 --page docs/realism.md
+    python training/compare.py limits --seeds 1 2 3 --samples 1e6 --page docs/reports/robustness.md
 
 `actions`: base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
 `hierarchy`: as Figure 9 of Peng et al. (2017), footstep planning above a trained controller, and control
