@@ -13,6 +13,7 @@ from unittest import mock
 import imageio.v3 as iio
 import mujoco
 import numpy as np
+import pytest
 import rich.console
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
@@ -419,6 +420,7 @@ class ReplayTest(FolderTest):
         self.assert_only()
 
 
+@pytest.mark.slow
 @unittest.skipUnless(CHROMIUM, 'needs Chromium: apt install chromium')
 class ChromiumTest(FolderTest):
     """In a real browser, without a screen."""

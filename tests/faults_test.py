@@ -1,8 +1,8 @@
 """Full disks, and signals at random times: nothing is lost, and nothing is left half-written.
 
 A server process imports the suite once and forks a child for every run, so that a run takes a second. The
-fast tests interrupt two programs once; the slow ones (`-m slow`) all of them by each signal, in FUZZ_EXAMPLES
-rounds, at times drawn from a seed that is printed.
+slow tests (`-m slow`) interrupt programs by each signal, in FUZZ_EXAMPLES rounds, at times drawn from a seed
+that is printed.
 """
 
 import contextlib
@@ -298,12 +298,6 @@ class FaultsTest(parameterized.TestCase):
             self.assertEqual(held, expected[path], path)
 
     @parameterized.named_parameters(
-        ('rollout', signal.SIGTERM, 'command', *ROLLOUT), ('sequence', signal.SIGKILL, 'learn'),
-    )  # fmt: skip
-    def test_a_signal(self, number, *arguments):
-        self.interrupted(0, [number], *arguments)
-
-    @parameterized.named_parameters(
         ('rollout', 'command', *ROLLOUT), ('gallery', 'draw'), ('training', 'train'),
         ('sequence', 'learn'),
     )  # fmt: skip
@@ -326,6 +320,7 @@ class FaultsTest(parameterized.TestCase):
             self.assertEqual((path.read_text(), one.read_text()), ('two', 'one'))
         self.assertEqual(self.files(self.folder), {'file': b'one'})
 
+    @pytest.mark.slow
     def test_a_signal_leaves_no_hidden_files(self):
         """Unlike SIGKILL, an interrupt and SIGTERM give a program the time to remove them."""
         for number in SIGNALS[1:]:

@@ -1,8 +1,8 @@
 """Files from strangers: whatever is in a file, it is read, or refused by name.
 
 Hypothesis changes valid files of every format, and writes pictures and meshes with any header, numbers
-and references to other files, which must not be opened. The fast tests always make the same changes; the slow ones
-(`-m slow`) draw a seed, print it, and take it from FUZZ_SEED if that is set; FUZZ_EXAMPLES says how many.
+and references to other files, which must not be opened. The tests that draw (`-m slow`) print their seed, and
+take it from FUZZ_SEED if that is set; FUZZ_EXAMPLES says how many files.
 """
 
 import base64
@@ -33,11 +33,7 @@ from hypothesis import strategies as st
 from trl_suite import characters, motion, policies, retargeting, sequences, terrain
 from trl_suite.runs import results, stage
 
-FAST = 30  # changed files of each format
-SLOW = int(os.environ.get('FUZZ_EXAMPLES', '2000'))
-COMMON = {
-    'deadline': None, 'database': None, 'suppress_health_check': list(hypothesis.HealthCheck),
-}  # fmt: skip
+EXAMPLES = int(os.environ.get('FUZZ_EXAMPLES', '2000'))
 WORDS = (
     b'nan', b'inf', b'-inf', b'NaN', b'Infinity', b'0', b'-1', b'1e-320', b'1e30', b'1e308', b'1e400',
     b'9' * 30, b'', b'"', b'{', b'}', b'[]', b'{}', b'null', b'true', b'<', b'/>', b'\n', b'\0', b'\xff',
@@ -80,31 +76,22 @@ def changed_archive(draw, whole):
         fields = dict(archive)
     name = draw(st.sampled_from(sorted(fields)))
     value = fields[name]
-    numbers = value.dtype.kind in 'iuf'
     how = draw(st.sampled_from(('drop', 'type', 'shape', 'value', 'empty')))
     if how == 'drop':
         del fields[name]
     elif how == 'type':
-        fields[name] = value.astype(draw(st.sampled_from(('U9', 'f4', '?')))) if numbers else 7
+        kind = draw(st.sampled_from(('U9', 'f4', '?')))
+        fields[name] = value.astype(kind) if value.dtype.kind in 'iuf' else 7
     elif how == 'shape':
         shape = draw(st.sampled_from(((*value.shape, 1), (-1,), (1, *value.shape))))
         fields[name] = value.reshape(shape)
-    elif how == 'value' and numbers and value.size:
+    elif how == 'value' and value.dtype.kind in 'iuf' and value.size:
         value = value.copy()
-        place = draw(st.integers(0, value.size - 1))
-        word = draw(
-            st.sampled_from(
-                (
-                    0,
-                    1,
-                    2,
-                    100,
-                    *((np.nan, np.inf, -1, 1e30, 1e308))[: 5 * (value.dtype.kind == 'f')],
-                )
-            )
-        )
+        numbers = (0, 1, 2, 100)
+        if value.dtype.kind == 'f':
+            numbers += (np.nan, np.inf, -1, 1e30, 1e308)
         with np.errstate(over='ignore'):
-            value.flat[place] = word
+            value.flat[draw(st.integers(0, value.size - 1))] = draw(st.sampled_from(numbers))
         fields[name] = value
     else:
         fields[name] = value[:0] if value.ndim else np.zeros(0)
@@ -393,14 +380,30 @@ class FuzzTest(parameterized.TestCase):
         cls.folder = pathlib.Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.files = files(cls.folder)
 
-    def check(self, name, settings):
+    def settings(self, test):
+        seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
+        print(f'FUZZ_SEED={seed}', flush=True)
+        settings = hypothesis.settings(
+            max_examples=EXAMPLES, deadline=None, database=None,
+            suppress_health_check=list(hypothesis.HealthCheck),
+        )  # fmt: skip
+        return hypothesis.seed(seed)(settings(test))
+
+    @parameterized.parameters(*FORMATS)
+    def test_valid_files(self, name):
         whole, suffix, read = self.files[name]
         path = self.folder / f'changed.{suffix}'
         path.write_bytes(whole)
         read(path)
+
+    @parameterized.parameters(*FORMATS)
+    @pytest.mark.slow
+    def test_changed_files(self, name):
+        whole, suffix, read = self.files[name]
+        path = self.folder / f'changed.{suffix}'
         make = changed_archive if suffix == 'npz' else changed
 
-        @settings
+        @self.settings
         @hypothesis.given(make(whole))
         def run(content):
             path.write_bytes(content)
@@ -412,7 +415,9 @@ class FuzzTest(parameterized.TestCase):
 
         run()
 
-    def check_written(self, make, settings):
+    @parameterized.parameters(picture, solid)
+    @pytest.mark.slow
+    def test_written_files(self, make):
         for name in ('secret', 'own.bin'):
             (self.folder / name).write_bytes(POSTSCRIPT)
         if not (self.folder / 'fifo').exists():
@@ -421,7 +426,7 @@ class FuzzTest(parameterized.TestCase):
         surface(self.folder / 'hill.obj')
         audit = Audit()
 
-        @settings
+        @self.settings
         @hypothesis.given(make())
         def run(written):
             suffix, content = written
@@ -440,23 +445,6 @@ class FuzzTest(parameterized.TestCase):
 
         run()
 
-    @parameterized.parameters(picture, solid)
-    def test_written_files(self, make):
-        self.check_written(
-            make, hypothesis.settings(max_examples=5 * FAST, derandomize=True, **COMMON)
-        )
-
-    @parameterized.parameters(picture, solid)
-    @pytest.mark.slow
-    def test_many_written_files(self, make):
-        settings = hypothesis.settings(max_examples=SLOW, **COMMON)
-        self.check_written(make, lambda test: hypothesis.seed(self.seed())(settings(test)))
-
-    def seed(self):
-        seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
-        print(f'FUZZ_SEED={seed}', flush=True)
-        return seed
-
     @parameterized.parameters(
         *((POSTSCRIPT, suffix) for suffix in terrain.custom.IMAGES),
         (b'mtllib a.mtl\nusemtl a\nv -1 -1 0\nv 1 -1 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n', '.obj'),
@@ -474,16 +462,6 @@ class FuzzTest(parameterized.TestCase):
                 self.assertIn(f'hill{suffix}: cannot be read as', str(error))
         mine = [name for event, name in events if event != 'open' or str(folder) in name]
         self.assertLen(mine, 1)  # the file itself
-
-    @parameterized.parameters(*FORMATS)
-    def test_changed_files(self, name):
-        self.check(name, hypothesis.settings(max_examples=FAST, derandomize=True, **COMMON))
-
-    @parameterized.parameters(*FORMATS)
-    @pytest.mark.slow
-    def test_many_changed_files(self, name):
-        settings = hypothesis.settings(max_examples=SLOW, **COMMON)
-        self.check(name, lambda test: hypothesis.seed(self.seed())(settings(test)))
 
 
 if __name__ == '__main__':

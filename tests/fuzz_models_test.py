@@ -1,6 +1,6 @@
 """MJCF and URDF files from a grammar: each is read, or refused by name, in limited time and memory.
 
-The grammar of MJCF is dm_control's schema. The fast tests always draw the same files; the slow ones
+The grammar of MJCF is dm_control's schema. One file of each kind is always the same; the slow tests
 (`-m slow`) draw a seed, print it, and take it from FUZZ_SEED if that is set; FUZZ_EXAMPLES says how many.
 """
 
@@ -23,7 +23,7 @@ from dm_control.mjcf import schema
 from trl_suite import characters, suite
 from trl_suite.util import limited
 
-FAST, SLOW = 6, int(os.environ.get('FUZZ_EXAMPLES', '500'))
+SLOW = int(os.environ.get('FUZZ_EXAMPLES', '500'))
 SECONDS = 3  # of processor time for one file
 NUMBERS = ('0', '1', '-1', '2', '0.1', '.05', '1.5', '90', '-30', '1e-3')
 POSITIVE = ('.1', '.1', '.2', '.5', '1', '1.5')
@@ -232,9 +232,9 @@ class FuzzTest(parameterized.TestCase):
         path.write_text(grammar.figure() if kind == 'mjcf' else grammar.robot())
         return path
 
-    @parameterized.product(kind=('mjcf', 'urdf'), seed=tuple(range(FAST)))
-    def test_files_from_a_grammar(self, kind, seed):
-        check(self.draw(kind, seed))
+    @parameterized.parameters('mjcf', 'urdf')
+    def test_a_file_from_a_grammar(self, kind):
+        check(self.draw(kind, 0))
 
     @parameterized.parameters('mjcf', 'urdf')
     @pytest.mark.slow
