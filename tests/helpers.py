@@ -18,7 +18,14 @@ from trl_suite.vector import VectorEnvironment
 KINDS = tuple(
     {(spec.task_type, spec.character): spec.id for spec in reversed(catalogue.SPECS)}.values()
 )
+LONG = ('gait', 'goal_navigation', 'soccer')  # task types whose steps last many control steps
 RIGHT, LEFT = 0, 1
+EVERY_PROPERTY = {  # all of a world that can be varied
+    'friction': (0.4, 1.2), 'mass': (0.8, 1.2), 'link_mass': (0.9, 1.1), 'inertia': (0.9, 1.1),
+    'com_offset': (0.0, 0.03), 'damping': (0.5, 2.0), 'gravity': (9.0, 10.5), 'slope': (-0.05, 0.05),
+    'contact_depth': (0.001, 0.01), 'contact_time': (0.005, 0.02),
+    'push': {'force': (50, 200), 'duration': (0.02, 0.2), 'interval': (0.0, 0.3)},
+}  # fmt: skip
 STEP_WEIGHTS = {  # of the reward of footsteps
     name: weight / 1.05
     for name, weight in (
@@ -51,9 +58,7 @@ def made(*parts, seed=0, flat=False, **options):
     test = os.environ.get('PYTEST_CURRENT_TEST')  # with unittest, which lacks it, each is new
     environment, user, _ = _kept.pop(key, (None, None, None))
     if environment is None or user == test:  # a test that asks twice compares two
-        spec = suite.combine(*parts) if len(parts) > 1 else parts[0]
-        spec = suite.find(spec) if isinstance(spec, str) else spec
-        environment = suite.build_environment(spec, options, {'flat_observation': flat})
+        environment = build(suite.combine(*parts) if len(parts) > 1 else parts[0], options, flat)
     _kept[key] = environment, test, options
     while len(_kept) > MOST_KEPT:
         _kept.pop(next(iter(_kept)))
@@ -85,6 +90,12 @@ def let_go():
 def body(environment, field, link):
     name = environment.task.character.spec.name
     return getattr(environment.physics.named.data, field)[f'{name}/{link}'].copy()
+
+
+def build(spec, options=None, flat=False):
+    """Returns a new environment of an id or specification, with options of the task."""
+    spec = suite.find(spec) if isinstance(spec, str) else spec
+    return suite.build_environment(spec, options, {'flat_observation': flat})
 
 
 def ankles(environment):
@@ -137,11 +148,18 @@ def assert_uniform(values, low, high):
     assert distance < 1.95 / np.sqrt(len(share)), distance
 
 
+def assert_refused(test, *cases, error=ValueError):
+    """Checks that each of some calls, (call, message), raises an error whose message matches."""
+    for call, message in cases:
+        with test.subTest(message), test.assertRaisesRegex(error, message):
+            call()
+
+
 # Simulations and single environments, saved states.
 
 
 def assert_rows_are_singles(
-    id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2, one=None
+    spec, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2, one=None
 ):
     """Checks that simulations equal single environments with their seeds, bit for bit.
 
@@ -149,7 +167,7 @@ def assert_rows_are_singles(
     time, and what it did before must not matter either.
 
     Args:
-      id_: id of the environment.
+      spec: id or specification of the environment.
       n: simulations.
       steps: number of steps; a simulation whose episode ends starts the next one.
       step_limit: after which episodes are cut.
@@ -164,15 +182,16 @@ def assert_rows_are_singles(
     """
     options = options or {}
     environments = VectorEnvironment(
-        id_, n, num_threads, seed, step_limit=step_limit, task_kwargs=options
+        spec, n, num_threads, seed, step_limit=step_limit, task_kwargs=options
     )
+    id_ = environments.spec.id
     rng, size = np.random.default_rng(0), len(environments.action_map)
     actions = [scale * rng.uniform(-1, 1, (n, size)) for _ in range(steps)]
     first, found = environments.reset(), []
     for action in actions:
         found.append(environments.step(action))
     if one is None:
-        one = suite.make(id_, {'step_limit': step_limit, **options}, {'flat_observation': True})
+        one = build(spec, {'step_limit': step_limit, **options}, flat=True)
     ends = 0
     for env_id, own in enumerate(environments.seeds.tolist()):
         one.random_state.seed(own)
