@@ -12,7 +12,7 @@ import pytest
 from absl.testing import absltest
 
 from trl_suite import evaluation, sequences
-from trl_suite.sequences import results
+from trl_suite.runs import results
 
 IDS = sequences.get('plaid_biped').ids
 
