@@ -1,9 +1,9 @@
-"""A learner for sequences of environments: fine-tuning with Stable-Baselines3's PPO.
+"""A learner for sequences of environments: fine-tunes one policy with Stable-Baselines3's PPO.
 
     cd examples
     trl-suite sequences run plaid_biped --learner continual_learning:FineTuning --output result.json
 
-One policy is trained on one environment after the other. Needs `pip install 'trl_suite[sb3]'`.
+Needs `pip install 'trl_suite[sb3]'`.
 """
 
 import copy
@@ -25,6 +25,7 @@ class FineTuning:
     def __init__(self, sequence, seed):
         first = SuiteVecEnv(sequence.ids[0], NUM_ENVS, seed=seed)  # determines sizes only
         self.scales = VecNormalize(first, norm_reward=False)
+        self.rms = self.scales.obs_rms
         self.model = PPO(
             'MlpPolicy', self.scales, n_steps=STEPS, batch_size=512, n_epochs=5, gamma=0.95,
             target_kl=0.05, seed=seed, device='cpu',
@@ -37,23 +38,22 @@ class FineTuning:
     def learn(self, stage, samples):
         """Trains in simulations that count their samples; more than the budget are refused."""
         environments = stage.environments(NUM_ENVS, autoreset='same_step', dtype=np.float32)
-        before, self.scales = (
-            self.scales,
-            VecNormalize(SuiteVecEnv(environments), norm_reward=False),
-        )
-        self.scales.obs_rms = before.obs_rms
+        self.scales = VecNormalize(SuiteVecEnv(environments), norm_reward=False)
+        self.scales.obs_rms = self.rms
         self.model.set_env(self.scales)
-        update = NUM_ENVS * STEPS
-        self.model.learn(samples // update * update)
+        self.model.learn(samples // (NUM_ENVS * STEPS) * NUM_ENVS * STEPS)
+
+    def layers(self):
+        network = self.model.policy
+        return torch.nn.Sequential(network.mlp_extractor.policy_net, network.action_net)
 
     def policy(self):
         """Returns the current policy, which further training does not change."""
-        network, rms = copy.deepcopy((self.model.policy, self.scales.obs_rms))
+        network, rms = copy.deepcopy((self.layers(), self.rms))
 
         def act(observation):
             seen = np.clip((observation - rms.mean) / np.sqrt(rms.var + 1e-8), -10, 10)
             with torch.no_grad():
-                action = network.get_distribution(torch.as_tensor(seen, dtype=torch.float32)).mode()
-            return np.clip(action.numpy(), -1, 1)
+                return network(torch.as_tensor(seen, dtype=torch.float32)).clamp(-1, 1).numpy()
 
         return act

@@ -39,12 +39,11 @@ class Plaid(FineTuning):
 
     def fit(self, observations, actions):
         """Fits the policy to the actions of experts."""
-        network, optimizer = self.model.policy, self.model.policy.optimizer
+        network, optimizer = self.layers(), self.model.policy.optimizer
         inputs = torch.as_tensor(self.scales.normalize_obs(observations.astype(np.float32)))
         targets = torch.as_tensor(actions, dtype=torch.float32)
         for _ in range(EPOCHS):
             for part in torch.randperm(len(inputs)).split(512):
-                mean = network.get_distribution(inputs[part]).mode()
                 optimizer.zero_grad()
-                (mean - targets[part]).square().mean().backward()
+                (network(inputs[part]) - targets[part]).square().mean().backward()
                 optimizer.step()
