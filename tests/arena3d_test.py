@@ -135,26 +135,6 @@ class GeometryTest(parameterized.TestCase):
             expected = stage.arena.grounds[0].height(px, py)
             np.testing.assert_allclose(stage.rays(px, py), expected, atol=SINGLE)
 
-    def test_sides_of_blocks_are_vertical(self):
-        stage = Stage('blocks3d', (3,))
-        boxes = stage.arena.surroundings.boxes[0]
-        geom, normal, met = np.zeros(1, np.int32), np.zeros(3), 0
-        for k in range(len(boxes.top)):
-            for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
-                start = np.array([*boxes.position[k], 0.5 * boxes.top[k]])
-                start[axis] -= sign * (boxes.half_size[k, axis] + 0.05)
-                if stage.height(*start[:2])[0] > 0:
-                    continue  # another block is there
-                direction = np.zeros(3)
-                direction[axis] = sign
-                distance = mujoco.mj_ray(
-                    stage.model, stage.data, start, direction, None, True, -1, geom, normal
-                )
-                self.assertAlmostEqual(distance, 0.05, delta=1e-9)
-                np.testing.assert_allclose(normal, -direction, atol=1e-12)
-                met += 1
-        self.assertGreater(met, 30)
-
     @parameterized.parameters(*BOXED, *GRIDS)
     def test_solver_and_friction(self, source):
         model = Stage(source).model
@@ -243,17 +223,6 @@ class DynamicsTest(parameterized.TestCase):
                 self.assertGreater(z, stage.height(x, y)[0] - 0.02)
                 self.assertLess(z, stage.height(np.add(x, [-0.1, 0, 0.1]), 3 * [y]).max() + 0.7)
 
-    def test_a_ball_rolls_down_the_ramp(self):
-        stage = Stage('ramp3d', load=BALL)
-        stage.put((-3, 0, stage.height(-3, 0)[0] + 0.1))
-        stage.run(2.0)
-        # A solid sphere that does not slip: 5/7 of what slides.
-        angle = np.arctan(0.1)
-        expected = 5 / 7 * 9.8 * np.sin(angle) * 2.0
-        self.assertAlmostEqual(-stage.velocity[0, 0] / np.cos(angle), expected, delta=0.03)
-        x, y, z = stage.position[0]
-        self.assertAlmostEqual(z, stage.height(x, y)[0] + 0.1 / np.cos(angle), delta=2e-3)
-
     @parameterized.parameters('conveyor3d', 'conveyor3d_wide')
     def test_a_body_on_a_belt_reaches_its_speed(self, source):
         stage = Stage(source, load=CUBE)
@@ -307,29 +276,6 @@ class DynamicsTest(parameterized.TestCase):
         stage.run(1.0, near)
         np.testing.assert_allclose(stage.velocity[0, :2], velocity, atol=2e-3)
 
-    def test_a_moving_box_pushes(self):
-        stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
-        k = self.alone(stage)
-        near = self.mover(stage, k)[0][None]
-        stage.arena.recentre(stage.env_ids, near)
-        centre, velocity, half = self.mover(stage, k)
-        speed = np.linalg.norm(velocity)
-        ahead = velocity / speed
-        gap = 0.3 + (half / np.maximum(np.abs(ahead), 1e-6)).min() + 0.15
-        stage.put((*(centre + gap * ahead), 0.1))
-        fastest = 0.0
-        for _ in range(60):
-            stage.run(1 / 30, near)
-            fastest = max(fastest, np.linalg.norm(stage.velocity[0]))
-        after, _, _ = self.mover(stage, k)
-        np.testing.assert_allclose(after - centre, 2 * velocity, atol=5e-3)  # nothing stops it
-        away = stage.position[0, :2] - after
-        self.assertGreater(away @ ahead, 0.2)  # still in front, or pushed aside
-        outside = np.abs(away) - half
-        self.assertGreater(outside.max(), 0.05)
-        self.assertLess(fastest, 2.2 * speed + 0.05)  # pushed, not shot off
-        self.assertGreater(fastest, 0.5 * speed)
-
     def test_moving_boxes_yield_to_what_is_caught_between_them(self):
         stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
         ground = terrain.SpatialGround(stage.arena.terrain, 5)
@@ -374,20 +320,6 @@ class DynamicsTest(parameterized.TestCase):
         stage.world.forward(stage.env_ids)
         np.testing.assert_allclose(stage.rays(x, y), stage.height(x, y), atol=EXACT)
         self.assertGreater((stage.height(x, y) > 0).sum(), 3)
-
-    def test_boxes_move_after_a_reset_of_the_world(self):
-        stage = Stage('dynamic_obstacles3d', (7,), load=BALL)
-        stage.world.reset(stage.env_ids)  # as placing a character does
-        stage.world.forward(stage.env_ids)
-        before = stage.arena.seen().centres()[0]
-        movers = stage.arena.grounds[0].layout.movers
-        begin = movers.start + movers.phase[:, None] * (movers.end - movers.start)
-        np.testing.assert_allclose(before, begin, atol=1e-12)
-        stage.put((0, 0, 50))
-        stage.run(0.5, np.full((1, 2), 0.0))
-        moved = np.linalg.norm(stage.arena.seen().centres()[0] - before, axis=1)
-        np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
-        self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
 
     def test_inertia_of_movers_does_not_loosen_the_solver(self):
         # The solver stops by a tolerance relative to the mean inertia.

@@ -546,22 +546,6 @@ class PlanarGroundTest(parameterized.TestCase):
         self.assertLess(leap.max(), 0.15)
         self.assertLess(np.median(leap), 0.08)
 
-    def test_ground_does_not_depend_on_the_order_of_queries(self):
-        for name in ('slopes_mixed', 'cliffs_rugged'):
-            once = self.make(name)
-            once.ensure(-100, 100)
-            steps = self.make(name)
-            for x in np.arange(0, 100, 0.7):
-                steps.height(x)
-            for x in np.arange(0, 100, 0.9):
-                steps.ensure(-x, x)
-            there = self.make(name)
-            there.window(2000, 10)
-            there.height([-77.0, 3.0])
-            for other in (steps, there):
-                for a, b in zip(other.window(-3900, 7800), once.window(-3900, 7800), strict=True):
-                    np.testing.assert_array_equal(a, b)
-
     def test_window(self):
         strip = self.make('walls')
         heights, vertical = strip.window(-500, 2000)
