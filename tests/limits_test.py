@@ -5,11 +5,9 @@ import dataclasses
 import fractions
 import json
 import os
-import pathlib
 import resource
 import struct
 import sys
-import tempfile
 import time
 import tracemalloc
 import zipfile
@@ -18,6 +16,7 @@ from unittest import mock
 import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import FolderTest
 from PIL import Image
 
 from trl_suite import (
@@ -109,11 +108,7 @@ FILES = {  # character files that ask for more than any computer has, and the fi
 }  # fmt: skip
 
 
-class LimitsTest(parameterized.TestCase):
-    def setUp(self):
-        super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-
+class LimitsTest(FolderTest):
     @parameterized.parameters(
         *((lambda id_=id_, **options: suite.make(id_, options), 'substeps') for id_ in IDS),
         (lambda **options: suite.build('dog', task='walk', task_kwargs=options), 'substeps'),
@@ -164,6 +159,14 @@ class LimitsTest(parameterized.TestCase):
         self.assertEqual(files.check_path(self.folder / 'a.npz', ('.npz',)).name, 'a.npz')
         self.assertLen([*self.folder.iterdir()], 1)
 
+    def assert_refused_unread(self, message, load, path):
+        tracemalloc.start()
+        with self.assertRaisesRegex(ValueError, message):
+            load(path)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        self.assertLess(most, 5e6)
+
     @parameterized.parameters(motion.load, motion.load_steps, policies.load)
     def test_an_archive_that_inflates(self, load):
         path = self.folder / 'bomb.npz'
@@ -174,21 +177,24 @@ class LimitsTest(parameterized.TestCase):
             for _ in range(300):
                 file.write(bytes(10**6))
         self.assertLess(path.stat().st_size, 10**6)
-        tracemalloc.start()
-        with self.assertRaisesRegex(
-            ValueError, r'bomb.npz: .*has 300 MB; expected no more than 268'
-        ):
-            load(path)
-        most = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        self.assertLess(most, 5e6)
+        message = r'bomb.npz: .*has 300 MB; expected no more than 268'
+        self.assert_refused_unread(message, load, path)
 
-    @parameterized.parameters(*READERS)
+    def test_a_picture_of_too_many_pixels(self):
+        path = self.folder / 'a.png'
+        iio.imwrite(path, np.zeros((4000, 2600), np.uint8))
+        message = '4000 x 2600 pixels; expected 2 or more .* no more than 1e'
+        self.assert_refused_unread(message, lambda path: terrain.from_image(path, 0.1), path)
+
+    @parameterized.parameters(*READERS, ('a.txt', lambda path: retargeting.read(path, 'dog')))
     def test_a_file_that_is_too_large(self, name, load):
         path = self.folder / name
         with path.open('wb') as file:
+            file.write(
+                b'{"Loop": true}' if name == 'a.txt' else b''
+            )  # the beginning tells the format
             file.truncate(3 * 10**9)  # takes no room on the disk
-        with self.assertRaisesRegex(ValueError, f'{name}: .*has 3000 MB; .* more than 268 MB'):
+        with self.assertRaisesRegex(ValueError, f'{name}: .*has 3000 MB'):
             load(path)
 
     @parameterized.parameters(*READERS)
@@ -278,26 +284,6 @@ class LimitsTest(parameterized.TestCase):
         (self.folder / 'a.amc').write_text(''.join(f'{i}\nroot 0 0 0\n' for i in range(9000)))
         with self.assertRaisesRegex(ValueError, 'a.amc: 9000 frames of 3001 bones'):
             motion.read_amc(self.folder / 'a.amc', self.folder / 'a.asf')
-
-    def test_the_format_is_told_by_the_beginning(self):
-        path = self.folder / 'a.txt'
-        with path.open('wb') as file:
-            file.write(b'{"Loop": true}')
-            file.truncate(3 * 10**9)
-        with self.assertRaisesRegex(ValueError, 'a.txt: has 3000 MB'):
-            retargeting.read(path, 'dog')
-
-    def test_a_picture_of_too_many_pixels(self):
-        path = self.folder / 'a.png'
-        iio.imwrite(path, np.zeros((4000, 2600), np.uint8))
-        tracemalloc.start()
-        with self.assertRaisesRegex(
-            ValueError, '4000 x 2600 pixels; expected 2 or more .* no more than 1e'
-        ):
-            terrain.from_image(path, 0.1)
-        most = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        self.assertLess(most, 5e6)  # it was not read
 
     def test_of_an_animated_picture_the_first_frame_is_read(self):
         """The number of frames would be no bound of their size."""

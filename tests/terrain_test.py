@@ -116,25 +116,21 @@ class ProcessTest(parameterized.TestCase):
             length = len(draw({'Type': kind}, 20.0, seed).heights) * 0.025
             self.assertBetween(length, 20.0 - 1e-9, 20.0 + longest_feature.get(name, 9.1))
 
-    def test_gaps(self):
-        counts, levels = runs(draw('gaps', 10_000.0))
-        floor = levels < 0
-        np.testing.assert_array_equal(levels[floor], -2)
-        np.testing.assert_array_equal(levels[~floor], 0)
-        self.assert_lengths(counts[floor], 0.5, 2)
-        # Between two gaps: the vertex after the gap, and the spacing.
-        self.assert_lengths(counts[~floor][:-1] - 1, 4, 7)
-
-    def test_depth_of_gaps(self):
-        _, levels = runs(draw('gaps_hopper', 5_000.0))
-        self.assert_uniform(levels[levels < 0], -2.5, -2)
-
-    def test_walls(self):
-        counts, levels = runs(draw('walls_humanoid', 10_000.0))
-        crest = levels > 0
-        np.testing.assert_array_equal(counts[crest], 8)
-        self.assert_uniform(levels[crest], 0.05, 0.25)
-        self.assert_lengths(counts[~crest][:-1] - 1, 2, 4)
+    @parameterized.parameters(
+        # Levels of floors or crests, their widths, and the ground between them, m.
+        ('gaps', (-2, -2), (0.5, 2), (4, 7)), ('gaps_hopper', (-2.5, -2), None, None),
+        ('walls_humanoid', (0.05, 0.25), None, (2, 4)),
+    )  # fmt: skip
+    def test_boxes(self, name, levels, widths, between):
+        counts, found = runs(draw(name, 10_000.0))
+        box = found != 0
+        self.assert_uniform(found[box], *levels)
+        if widths:
+            self.assert_lengths(counts[box], *widths)
+        if name.startswith('walls'):
+            np.testing.assert_array_equal(counts[box], 8)
+        if between:  # the vertex after the box, and the spacing
+            self.assert_lengths(counts[~box][:-1] - 1, *between)
 
     def test_steps_go_up_as_often_as_down(self):
         counts, levels = runs(draw('steps', 10_000.0))
@@ -146,7 +142,7 @@ class ProcessTest(parameterized.TestCase):
         # A tread is the vertex of the riser and the spacing.
         self.assert_lengths(counts[1:-1] - 1, 5, 7)
 
-    def test_steps_humanoid_only_ascend(self):
+    def test_steps_and_cliffs_of_the_humanoid_have_one_direction(self):
         _, levels = runs(draw('steps_humanoid', 3_000.0))
         rises = np.diff(levels)
         self.assertBetween(rises.min(), 0.05 - 1e-9, 0.06)
@@ -154,27 +150,22 @@ class ProcessTest(parameterized.TestCase):
         # The second range is 0.1 to 0.15: the mean of both is 0.1125, the grade about 6 %.
         self.assertAlmostEqual(rises.mean(), 0.1125, delta=0.004)
         self.assertAlmostEqual(levels[-1] / 3_000, 0.06, delta=0.006)
-
-    def test_cliffs_humanoid_only_descend(self):
         _, levels = runs(draw('cliffs_humanoid', 5_000.0))
         self.assert_uniform(np.diff(levels), -1, -0.3)
 
     @parameterized.parameters(
-        ((0.0, 0.0), (0.2, 0.3), 'up'),
-        ((-0.3, -0.2), (0.0, 0.0), 'down'),
-        ((0.0, 0.2), (-0.2, 0.0), 'both'),  # one end at 0 does not switch a range off
+        ((0.0, 0.0), (0.2, 0.3), {1}),
+        ((-0.3, -0.2), (0.0, 0.0), {-1}),
+        ((0.0, 0.2), (-0.2, 0.0), {-1, 1}),  # one end at 0 does not switch a range off
+        ((0.0, 0.0), (0.0, 0.0), set()),
     )
-    def test_range_of_rises(self, first, second, direction):
+    def test_range_of_rises(self, first, second, directions):
         step = planar('steps', StepSpacingMin=0, StepSpacingMax=0, StepH0Min=first[0],
                       StepH0Max=first[1], StepH1Min=second[0], StepH1Max=second[1])  # fmt: skip
-        rises = np.diff(draw(step).heights)
-        self.assertEqual({'up': {1}, 'down': {-1}, 'both': {-1, 1}}[direction], {*np.sign(rises)})
-
-    def test_both_rise_ranges_off(self):
-        off = planar('steps', StepH0Min=0, StepH0Max=0, StepH1Min=0, StepH1Max=0)
-        profile = draw(off)
-        np.testing.assert_array_equal(profile.heights, 0)
-        self.assertFalse(profile.vertical.any())
+        profile = draw(step)
+        rises = np.diff(profile.heights)
+        self.assertEqual({*np.sign(rises[rises != 0])}, directions)
+        self.assertEqual(profile.vertical.any(), bool(directions))
 
     def test_narrow_gaps(self):
         counts, levels = runs(draw('narrow_gaps', 20_000.0))
