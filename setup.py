@@ -11,6 +11,7 @@ TORCH = 'torch>=2.5'
 # (rendering/web_guard.py), and Ray has changed the interface of RLlib in minor versions.
 BVH = 'pybvh>=0.9,<1'
 VISER = 'viser>=1.1,<1.2'
+MINARI = 'minari[hdf5]>=0.5,<0.6'
 RAY = '>=2.54.1,<2.61'
 
 VERSION = '0.1.0'
@@ -97,6 +98,7 @@ setup(
         'viewer': [VISER],
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
+        'minari': [MINARI],
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
         'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],
         'cluster': [f'ray{RAY}', 'fsspec'],
@@ -111,6 +113,7 @@ setup(
             'build',
             'gymnasium>=1.1',
             'hypothesis>=6',
+            MINARI,
             'imageio[ffmpeg]',
             'matplotlib',
             'pycollada',

@@ -67,7 +67,7 @@ myst_heading_anchors = 3
 default_role = 'code'
 autodoc_member_order = 'bysource'
 suppress_warnings = ['ref.python']  # fields of the same name in two classes
-autodoc_mock_imports = ['stable_baselines3']
+autodoc_mock_imports = ['minari', 'stable_baselines3']
 napoleon_use_ivar = True  # the fields of a NamedTuple are listed once
 
 html_theme = 'furo'

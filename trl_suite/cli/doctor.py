@@ -33,7 +33,7 @@ EXTRAS = {
     'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'viewer': ('viser',),
     'gymnasium': ('gymnasium',), 'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',),
     'rllib': ('ray',), 'cluster': ('ray', 'fsspec'), 'shimmy': ('shimmy',), 'train': ('torch',),
-    'tune': ('cma',), 'clips': ('pybvh',),
+    'tune': ('cma',), 'clips': ('pybvh',), 'minari': ('minari', 'h5py'),
 }  # fmt: skip
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',

@@ -7,6 +7,7 @@
     trl-suite view PD_Dog2D_Gaps_Terrain-v0 --browser
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --option randomize=robot --option sensors=mild
+    trl-suite dataset PD_Dog2D_Gaps_Terrain-v0 --policy mixed --episodes 100 --minari
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite try robot.urdf --spatial
@@ -35,6 +36,7 @@ from trl_suite.cli import (
     bench,
     clip,
     compile,
+    dataset,
     doctor,
     evaluate,
     info,
@@ -54,6 +56,7 @@ COMMANDS = (
     rollout,
     view,
     evaluate,
+    dataset,
     terrain,
     clip,
     try_file,

@@ -1,0 +1,91 @@
+"""Data sets in Minari's format: contents, and the same bytes from the same recipe."""
+
+import importlib.util
+import json
+import os
+import pathlib
+import tempfile
+import unittest
+from unittest import mock
+
+import cli_test
+import gymnasium
+import numpy as np
+from absl.testing import absltest
+
+if importlib.util.find_spec('minari') is None:
+    raise unittest.SkipTest('needs minari')
+
+import minari
+
+from trl_suite.adapters import minari as adapter
+
+ID = 'PD_Biped2D_Flat-v0'
+
+
+class DataSetTest(cli_test.CommandTest):
+    def setUp(self):
+        super().setUp()
+        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.enter('a')
+
+    def enter(self, name):
+        path = str(self.folder / name)
+        self.enterContext(mock.patch.dict(os.environ, {adapter.FOLDER: path}))
+
+    def contents(self, name, dataset):
+        folder = self.folder / name / dataset / 'data'
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def test_episodes_are_those_of_gymnasium(self):
+        name = adapter.write(ID, 'mixed', 4, seed=3, num_threads=2)
+        dataset = minari.load_dataset(name)
+        self.assertEqual(dataset.total_episodes, 4)
+        env = dataset.recover_environment()
+        for episode in dataset.iterate_episodes():
+            observation, info = env.reset(seed=self.seed(episode))
+            np.testing.assert_array_equal(episode.observations[0], observation)
+            for t, action in enumerate(episode.actions):
+                observation, reward, terminated, truncated, info = env.step(action)
+                np.testing.assert_array_equal(episode.observations[t + 1], observation)
+                self.assertEqual(episode.rewards[t], reward)
+                self.assertEqual(episode.terminations[t], terminated)
+                self.assertEqual(episode.truncations[t], truncated)
+                self.assertEqual(episode.infos['distance'][t + 1], info['distance'])
+            self.assertTrue(terminated or truncated)
+        self.assertEqual(gymnasium.spec(f'trl_suite/{ID}').id, env.spec.id)
+
+    @staticmethod
+    def seed(episode):
+        return int(np.random.SeedSequence(3).generate_state(4, np.uint32)[episode.id])
+
+    def test_the_same_recipe_gives_the_same_bytes(self):
+        name = adapter.write(ID, 'mixed', 3, num_threads=1)
+        first = self.contents('a', name)
+        self.enter('b')
+        with mock.patch.object(adapter, 'CHUNK', 2):
+            out = self.output('dataset', ID, '--policy', 'mixed', '--episodes', '3', '--minari')
+        self.assertEqual(out, f'{name}\n')
+        self.assertEqual(self.contents('b', name), first)
+        recipe = json.loads(json.loads(first['metadata.json'])['description'])
+        self.assertEqual((recipe['policy'], recipe['episodes'], recipe['seed']), ('mixed', 3, 0))
+        self.assertLen(recipe['sha256'], 64)
+        self.enter('c')
+        adapter.write(ID, 'mixed', 3, seed=1)
+        self.assertNotEqual(self.contents('c', name)['main_data.hdf5'], first['main_data.hdf5'])
+
+    def test_refusals(self):
+        name = adapter.write(ID, 'random', 1)
+        with self.assertRaisesRegex(
+            ValueError, f'{name}: exists; remove it, or set another folder'
+        ):
+            adapter.write(ID, 'random', 1)
+        with self.assertRaisesRegex(ValueError, "unknown policy 'mixd'; did you mean 'mixed'"):
+            adapter.write(ID, 'mixd', 1)
+        with self.assertRaisesRegex(ValueError, 'episodes is 0'):
+            adapter.write(ID, 'random', 0)
+        self.assertEqual([path.name for path in (self.folder / 'a').iterdir()], [name])
+
+
+if __name__ == '__main__':
+    absltest.main()
