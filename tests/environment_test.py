@@ -31,7 +31,7 @@ from helpers import (
 from trl_suite import characters, describe, motion, policies, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
-from trl_suite.tasks.imitation.planar import PlanarImitation
+from trl_suite.tasks.imitation.task import PlanarImitation
 from trl_suite.vector import VectorEnvironment
 
 # Links and joints of each figure; muscles where it has any.

@@ -10,7 +10,7 @@ from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks import terms
 from trl_suite.tasks.common import rewards
-from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
+from trl_suite.tasks.imitation.task import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.

@@ -9,9 +9,9 @@ from absl.testing import absltest, parameterized
 from helpers import made
 
 from trl_suite import policies, suite
+from trl_suite.bodies.reference import joint_targets
 from trl_suite.policies import files
 from trl_suite.policies.mirror import Mirror, blocks, exchanged
-from trl_suite.tasks.imitation.spatial import joint_targets
 from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 

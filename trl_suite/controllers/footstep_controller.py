@@ -8,7 +8,7 @@ controller = footstep_controller.load('mine.npz')  # the same
 controller = footstep_controller.load(lambda observation: my_network(observation))  # or any function
 
 A controller is called every 1/30 s. It takes observations of
-`trl_suite.tasks.footsteps.spatial.SpatialFootsteps`, (n, 125) without a terrain map, and returns
+`trl_suite.tasks.footsteps.task.SpatialFootsteps`, (n, 125) without a terrain map, and returns
 actions in [-1, 1], (n, 17). It must be stateless; the observation includes the phase.
 """
 

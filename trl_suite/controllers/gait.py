@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.bodies.planar import PlanarState
 from trl_suite.characters import Character
 from trl_suite.controllers import dynamics, gaits, parameters
 from trl_suite.controllers.dynamics import Mechanics
 from trl_suite.controllers.machine import STATES, GaitRules, GaitState, Machine, Scratch
 from trl_suite.controllers.parameters import KINDS, Parameters
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import PlanarState
 from trl_suite.util import errors
 from trl_suite.util.compiled import packed
 

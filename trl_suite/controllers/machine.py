@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.bodies.planar import PlanarState
 from trl_suite.controllers.dynamics import Mechanics, Skeleton, solve, write_inertia
 from trl_suite.controllers.parameters import KINDS
-from trl_suite.kinematics.planar import PlanarState
 from trl_suite.util.compiled import compiled, compiled_inline
 
 CONTROL_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate, and characters fall below 300 Hz

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
-from trl_suite.kinematics.blocks import Block
+from trl_suite.bodies.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.variation import CommonOptions, additions, sensors, worlds

@@ -77,7 +77,7 @@ def observes_terrain(task: Any) -> bool:
 def terrain_samples(task: Any, physics: Any) -> np.ndarray:
     """Returns where the terrain is observed, on its surface, (samples, 3) m."""
     if not task.arena.terrain.spatial:
-        body = task.figure.body
+        body = task.figure.ids
         x, _, pitch = physics.data.qpos[body.qpos[:3]]
         facing = -1.0 if abs(pitch) > np.pi / 2 and np.cos(pitch) < 0 else 1.0
         places = x + body.samples * facing

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.bodies.blocks import Block
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import Block
 from trl_suite.util.random import Streams
 
 if TYPE_CHECKING:

@@ -16,8 +16,9 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from trl_suite.actuation.action_map import ActionMap
+from trl_suite.bodies.blocks import Block, layout
 from trl_suite.engine import PhysicsWorld, World
-from trl_suite.kinematics.blocks import Block, layout
+from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.component import Component, position, seed_of
 from trl_suite.tasks.terms import Outcome, Term, outcome
 from trl_suite.util import errors
@@ -73,7 +74,7 @@ class Task(composer.Task):
 
     1. `apply_action`: clips the actions, sets the controls, and moves ground windows if necessary;
     2. `simulate`: advances the physics;
-    3. `finish_step`: updates the clock, checks for divergence, measures the character, and computes
+    3. `finish_step`: checks for divergence, measures the body, updates the clock, and computes
        reward, failure and observation, in this order.
 
     Several threads call `reset` and `step`, each for some of the simulations. A call may change
@@ -83,7 +84,9 @@ class Task(composer.Task):
 
     Attributes:
       world: the simulations; set by `bind`.
+      arena: the arena with the terrain.
       action_map: the map from actions to physical units.
+      mirror: reflection of observations and actions, for policies; None if it is not available.
       observed: the blocks of the observation, in order, terrain first; some may be empty.
       blocks: name -> slice of the observation, in order; a task may set it instead of `observed`.
       terms: the terms of the reward, in order.
@@ -96,7 +99,9 @@ class Task(composer.Task):
     """
 
     world: World
+    arena: Any  # PlanarArena or SpatialArena
     action_map: ActionMap
+    mirror: Mirror | None = None
     terms: tuple[Term, ...] = ()
     outcome: Outcome
     components: tuple[Component, ...] = ()
@@ -151,7 +156,7 @@ class Task(composer.Task):
 
     @functools.cached_property
     def blocks(self) -> dict[str, slice]:
-        return layout(self.observed)
+        return layout(vars(self).get('observed', ()))
 
     def _allocate(self, n: int, distance: np.ndarray) -> None:
         """Allocates the outcome of n simulations; `info` has it, and their distances (n,) in m."""
@@ -276,11 +281,11 @@ class Task(composer.Task):
 
     def get_state(self, env_id: int) -> dict[str, Any]:
         """Returns the state of one simulation, except that of the world and of components."""
-        return {'arena': self.arena.state(env_id), 'arrays': _state(self.saved, env_id)}  # type: ignore[attr-defined]
+        return {'arena': self.arena.state(env_id), 'arrays': _state(self.saved, env_id)}
 
     def set_state(self, env_id: int, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the caller restores the world's state afterwards."""
-        self.arena.restore(env_id, state['arena'])  # type: ignore[attr-defined]
+        self.arena.restore(env_id, state['arena'])
         _restore(self.saved, env_id, state['arrays'])
 
     def get_whole_state(self, env_id: int) -> dict[str, Any]:

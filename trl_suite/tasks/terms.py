@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.blocks import by_name
+from trl_suite.bodies.blocks import by_name
 from trl_suite.util.compiled import compiled
 
 

@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
+from trl_suite.bodies.blocks import SPIN, VECTOR, Block, Noise, signs
+from trl_suite.bodies.body import Measurement, ahead_and_left, polar
+from trl_suite.bodies.spatial import SpatialState
+from trl_suite.bodies.state import FLAG, PLACE, WHOLE, allocated
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import SPIN, VECTOR, Block, Noise, signs
-from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
-from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR
+from trl_suite.tasks.common.goals import GOAL, GOAL_AWAY, GOAL_COLOUR
 from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, random_displacement
 from trl_suite.tasks.terms import Outcome, Term, give, terms_data
 from trl_suite.terrain import PRESETS3D
@@ -29,7 +31,6 @@ SOLREF = (0.01, 1)  # soft enough for a mass of 0.1 kg
 DRAG = 0.5  # ratio of its velocity to that one second earlier, without contact
 BALL_AWAY = (0.7, 10.0)  # m; distance from the walker when it is placed
 BALL_LASTS = (100.0, 200.0)  # s until it is placed again
-GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
 AT_GOAL, NEAR = 0.5, 2.0  # m; distances of the ball from goal and walker for full reward
 SPEED = 1.0  # m/s; target speed of walker and ball
 SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
@@ -78,14 +79,14 @@ class BallState(NamedTuple):
       wanted: whether it must be placed again now.
     """
 
-    due: np.ndarray
-    begin: np.ndarray
-    walker: np.ndarray
-    at_goal: np.ndarray
-    wanted: np.ndarray
+    due: np.ndarray = WHOLE
+    begin: np.ndarray = PLACE
+    walker: np.ndarray = PLACE
+    at_goal: np.ndarray = FLAG
+    wanted: np.ndarray = FLAG
 
 
-class BallRules(NamedTuple):
+class BallData(NamedTuple):
     """Balls for compiled functions.
 
     Attributes:
@@ -105,25 +106,16 @@ class BallRules(NamedTuple):
     state: BallState
 
 
-def ball_state(n: int) -> BallState:
-    """Allocates the state of n balls."""
-    return BallState(
-        np.zeros(n, int), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool), np.zeros(n, bool)
-    )
-
-
-def no_ball(n: int) -> BallRules:
+def no_ball(n: int) -> BallData:
     """Returns the rules for a task without a ball."""
-    return BallRules(-1, -1, -1, 0.0, 0.0, terms_data(soccer_terms()), ball_state(n))
+    return BallData(-1, -1, -1, 0.0, 0.0, terms_data(soccer_terms()), allocated(BallState, n))
 
 
 # Of simulation i.
 
 
 @compiled
-def remember(
-    i: int, physics: SpatialState, measurement: SpatialMeasurement, ball: BallRules
-) -> None:
+def remember(i: int, physics: SpatialState, measurement: Measurement, ball: BallData) -> None:
     """Stores the positions of ball and walker at the beginning of a step."""
     for k in range(3):
         ball.state.begin[i, k] = physics.qpos[i, ball.qpos + k]
@@ -133,7 +125,7 @@ def remember(
 @compiled
 def dribble(
     i: int, seconds: float, goal: np.ndarray, physics: SpatialState,
-    measurement: SpatialMeasurement, ball: BallRules, outcome: Outcome,
+    measurement: Measurement, ball: BallData, outcome: Outcome,
 ) -> float:  # fmt: skip
     """Writes the reward terms of a step, and whether the ball is at its goal.
 
@@ -196,8 +188,8 @@ def _speed_along(
 
 @compiled
 def observe_ball(
-    i: int, columns: Any, goal: np.ndarray, physics: SpatialState, measurement: SpatialMeasurement,
-    ball: BallRules, observation: np.ndarray,
+    i: int, columns: Any, goal: np.ndarray, physics: SpatialState, measurement: Measurement,
+    ball: BallData, observation: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes the blocks `BALL_GOAL` and `BALL`, in the heading frame of the walker.
 
@@ -269,12 +261,12 @@ class Ball:
             model.dof_damping[self.dof] = np.repeat([MASS * rate, inertia * rate], 3)
             world.set_const(env_id)
 
-        self.state = ball_state(world.n)
+        self.state = allocated(BallState, world.n)
 
-    def rules(self, target_speed: float, goal_radius: float, terms: Iterable[Term]) -> BallRules:
-        """Returns the balls for compiled functions; see `BallRules`."""
+    def rules(self, target_speed: float, goal_radius: float, terms: Iterable[Term]) -> BallData:
+        """Returns the balls for compiled functions; see `BallData`."""
         qpos, dof = int(self.qpos[0]), int(self.dof[0])
-        return BallRules(
+        return BallData(
             qpos, dof, int(self._body), target_speed, goal_radius, terms_data(terms), self.state
         )
 

@@ -122,19 +122,3 @@ def missed(task: Any) -> str:
     if task.max_landing_error is None:
         return ''
     return f'a foot lands more than {task.max_landing_error:g} m from its landing place; '
-
-
-def contact_share(threshold: float, decay: float, gain: float) -> str:
-    """Returns the condition on `d`, an exponentially decaying average of contacts."""
-    return (
-        f'd > {threshold:g}, where every sample multiplies d by {decay:g} and adds 1/{1 / gain:.0f} if '
-        'there is contact'
-    )
-
-
-def samples_until_fall(threshold: float, decay: float, gain: float) -> int:
-    """Returns the number of consecutive samples with contact that count as a fall."""
-    share, count = 0.0, 0
-    while share <= threshold:
-        share, count = decay * share + gain, count + 1
-    return count

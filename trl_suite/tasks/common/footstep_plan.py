@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.bodies.blocks import VECTOR, Block, Noise, Reflection
+from trl_suite.bodies.body import Measurement, ahead_and_left
+from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
-from trl_suite.kinematics.blocks import VECTOR, Block, Noise, Reflection
-from trl_suite.kinematics.spatial import SpatialMeasurement, ahead_and_left
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.terms import wrapped
 from trl_suite.util.compiled import compiled
@@ -67,30 +68,41 @@ class FootstepPlan(NamedTuple):
       landed: whether a foot landed in the last step, (n,).
     """
 
-    stance: np.ndarray
-    landing: np.ndarray
-    heading: np.ndarray
-    landing_error: np.ndarray
-    heading_error: np.ndarray
-    landed: np.ndarray
+    stance: np.ndarray = WHOLE
+    landing: np.ndarray = np.zeros((2, 3))
+    heading: np.ndarray = REAL
+    landing_error: np.ndarray = REAL
+    heading_error: np.ndarray = REAL
+    landed: np.ndarray = FLAG
 
 
-def footstep_plan(n: int) -> FootstepPlan:
-    """Allocates the plans of n simulations."""
-    return FootstepPlan(
-        np.zeros(n, int),
-        np.zeros((n, 2, 3)),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n, bool),
-    )
+class Planned:
+    """Short names for the plan of a task.
+
+    Attributes:
+      plan: the plan of each simulation.
+    """
+
+    plan: FootstepPlan
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Stance foot, `RIGHT` or `LEFT`, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Landing places of the swing foot, then of the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
 
 
 @compiled
-def update_stance(
-    i: int, phase: float, measurement: SpatialMeasurement, plan: FootstepPlan
-) -> bool:
+def update_stance(i: int, phase: float, measurement: Measurement, plan: FootstepPlan) -> bool:
     """Switches the stance foot if the phase is in the other half, and writes the landing errors.
 
     Returns:
@@ -111,11 +123,11 @@ def update_stance(
 def observe_plan(
     i: int,
     columns: Any,
-    measurement: SpatialMeasurement,
+    measurement: Measurement,
     plan: FootstepPlan,
     observation: np.ndarray,
 ) -> None:
-    """Writes the blocks `CONTACT` and `PLAN`; see `SpatialFootsteps`."""
+    """Writes the blocks `CONTACT` and `PLAN`; see `Footsteps`."""
     column = columns.plan
     for foot in range(2):
         observation[i, columns.contact + foot] = measurement.contact[i, foot]

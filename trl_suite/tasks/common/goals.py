@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.blocks import Block, Noise, signs
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
+from trl_suite.arenas import SpatialArena
+from trl_suite.bodies.blocks import Block, Noise, signs
+from trl_suite.bodies.state import FLAG, PLACE, WHOLE
+from trl_suite.engine import World
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, random_displacement
+
+if TYPE_CHECKING:
+    from trl_suite.tasks.common.ball import Ball
 
 GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is redrawn
+GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
 GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)
-FLAG = (0.1, 0.6, 0.0)  # m; marker of the goal: radius and half height of a cylinder
+FLAG_SIZE = (0.1, 0.6, 0.0)  # m; marker of the goal: radius and half height of a cylinder
 
 
 class Goals(NamedTuple):
@@ -24,23 +31,10 @@ class Goals(NamedTuple):
       wanted: whether it must be redrawn now, (n,).
     """
 
-    place: np.ndarray
-    due: np.ndarray
-    reached: np.ndarray
-    wanted: np.ndarray
-
-
-def goals(n: int) -> Goals:
-    """Allocates the goals of n simulations."""
-    return Goals(np.zeros((n, 3)), np.zeros(n, int), np.zeros(n, int), np.zeros(n, bool))
-
-
-def set_goal(
-    env_id: int, place: np.ndarray, count: int, random: np.random.Generator, goals: Goals
-) -> None:
-    """Sets a goal (3,) m at control step `count` of the episode, and draws when it expires."""
-    goals.place[env_id] = place
-    goals.due[env_id] = count + round(random.uniform(*GOAL_LASTS) / CONTROL_TIMESTEP)
+    place: np.ndarray = PLACE
+    due: np.ndarray = WHOLE
+    reached: np.ndarray = WHOLE
+    wanted: np.ndarray = FLAG
 
 
 GOAL = Block(
@@ -51,4 +45,79 @@ GOAL = Block(
 
 def flag(goal: Any) -> Marker:
     """Returns the marker of a goal (3,), m."""
-    return Marker('cylinder', np.add(goal, (0, 0, FLAG[1])), FLAG, GOAL_COLOUR)
+    return Marker('cylinder', np.add(goal, (0, 0, FLAG_SIZE[1])), FLAG_SIZE, GOAL_COLOUR)
+
+
+class GoalDrawer:
+    """Draws the goals of all simulations, and places their balls, if there are any."""
+
+    def __init__(
+        self,
+        arena: SpatialArena,
+        ball: Ball | None,
+        rule: str,
+        distance: tuple[float, float] | None = None,
+    ) -> None:
+        """Keeps how goals are drawn; `bind` is called before they are.
+
+        Args:
+          arena: the arena, which draws goals by the rule.
+          ball: the ball, whose goal is drawn around it; None: the goal is that of the walker.
+          rule: where goals of a walker are, see `SpatialGround.goal`.
+          distance: minimum and maximum distance of goals from walker or ball, in any direction, m;
+            None: by the rule, or `GOAL_AWAY` from a ball.
+        """
+        self._arena, self._ball, self._rule, self._distance = arena, ball, rule, distance
+
+    def bind(
+        self, world: World, goals: Goals, steps: np.ndarray, random: list[np.random.Generator]
+    ) -> None:
+        """Connects it to a world.
+
+        Args:
+          world: the simulations.
+          goals: their goals, written here.
+          steps: control steps of each episode, (n,).
+          random: the random generator of each simulation; a list that the task updates.
+        """
+        self._world, self._goals, self._steps, self._random = world, goals, steps, random
+
+    def begin(self, i: int, place: np.ndarray) -> None:
+        """Places the ball of a simulation, and draws the first goal of its episode.
+
+        Args:
+          i: index of the simulation.
+          place: position of the walker, (2,) m.
+        """
+        if self._ball:
+            self._ball.put(i, place, self._steps[i], self._random[i])
+        self._draw(i, place)
+
+    def redraw(self, env_ids: np.ndarray, places: np.ndarray) -> None:
+        """Places balls and draws goals again, where they have expired or were reached.
+
+        Args:
+          env_ids: indices of simulations.
+          places: positions of the walkers of all simulations, (n, 2) m.
+        """
+        if self._ball:
+            wanted = env_ids[self._ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self._ball.put(i, places[i], self._steps[i], self._random[i])
+            self._world.forward(wanted)
+        for i in env_ids[self._goals.wanted[env_ids]].tolist():
+            self._draw(i, places[i])
+
+    def _draw(self, i: int, place: np.ndarray) -> None:
+        random = self._random[i]
+        if self._ball:
+            goal = self._ball.goal(i, random, self._distance or GOAL_AWAY)
+        elif self._distance is None:
+            goal = self._arena.goal(i, random, place, self._rule)
+        else:
+            x, y = place + random_displacement(random, *self._distance)
+            height = self._arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
+            goal = np.array([x, y, height[0, 0]])
+        self._goals.place[i] = goal
+        lasts = random.uniform(*GOAL_LASTS)
+        self._goals.due[i] = self._steps[i] + round(lasts / CONTROL_TIMESTEP)

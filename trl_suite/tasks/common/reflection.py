@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap, AngleAxisMap
+from trl_suite.bodies.blocks import SPIN, Reflection
 from trl_suite.characters import Character
-from trl_suite.kinematics.blocks import SPIN, Reflection
 
 ANGLE_AXIS = (1.0, -1.0, -1.0, 1.0)  # angle; forward, up, right
 

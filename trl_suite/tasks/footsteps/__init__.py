@@ -4,8 +4,12 @@ from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.common import differences
 from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.footsteps import description
-from trl_suite.tasks.footsteps.planar import PlanarFootsteps, PlanarFootstepsConfig
-from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
+from trl_suite.tasks.footsteps.task import (
+    PlanarFootsteps,
+    PlanarFootstepsConfig,
+    SpatialFootsteps,
+    SpatialFootstepsConfig,
+)
 from trl_suite.tasks.task_type import TaskType, tracking
 
 TYPES = (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.tasks.common import description
+from trl_suite.tasks.common import description, falls
 from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
@@ -122,11 +122,8 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
         notes.append('0 if the speed is negative')
     yield description.reward(task, *notes, title='Reward of a cycle')
     links = ', '.join(figure.fall_links)
-    share = gait_rules.FALL_THRESHOLD, gait_rules.CONTACT_DECAY, gait_rules.CONTACT_GAIN
     ends = [
-        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
-        f'{description.samples_until_fall(*share)} consecutive samples, or so often that '
-        f'{description.contact_share(*share)}',
+        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} {falls.condition()}',
         f'the pitch of the root is more than {np.degrees(gait_rules.TURNED):.0f} degrees',
         f'the root has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
         'the physics diverges',

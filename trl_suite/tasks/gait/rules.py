@@ -8,21 +8,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.bodies.blocks import Block
+from trl_suite.bodies.planar import (
+    PlanarBodyData,
+    breaks_down,
+    has_left,
+    measure,
+    observe_body,
+)
+from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import CONTROL_TIMESTEP, gaits
 from trl_suite.controllers.machine import GaitRules, touches
 from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
-from trl_suite.kinematics.blocks import Block
-from trl_suite.kinematics.planar import (
-    PlanarIds,
-    PlanarMeasurement,
-    is_lost,
-    leaves,
-    measure,
-)
+from trl_suite.tasks.common import falls
 from trl_suite.tasks.terms import Outcome, Term, begin, conclude, give, score
-from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
@@ -34,16 +35,8 @@ INTERFACES = ('parameters', 'base_action')
 
 # Conditions of failure, tested every SAMPLE.
 SAMPLE = 0.1  # s
-CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
-    0.9,
-    1 / 11,
-    0.25,
-)  # of the decaying average of samples with a fall link on the ground
 TURNED = 0.8 * np.pi  # rad; largest pitch
-PATIENCE, PROGRESS = (
-    5.0,
-    0.5,
-)  # s, m; an episode fails if the root moves less than this in this time
+PATIENCE, PROGRESS = 5.0, 0.5  # s, m; least distance of the root in a time
 MAX_JOINT_SPEED = 1000.0  # rad/s; high, since these joints have no damping
 
 STUMBLE_SHARPNESS = 10.0
@@ -81,18 +74,18 @@ class GaitTaskState(NamedTuple):
     """
 
     action: np.ndarray
-    going: np.ndarray
-    waiting: np.ndarray
-    lasted: np.ndarray
-    stumbled: np.ndarray
-    age: np.ndarray
-    start: np.ndarray
-    down: np.ndarray
-    milestone: np.ndarray
-    fell: np.ndarray
-    stuck: np.ndarray
-    duration: np.ndarray
-    stumbling: np.ndarray
+    going: np.ndarray = FLAG
+    waiting: np.ndarray = FLAG
+    lasted: np.ndarray = WHOLE
+    stumbled: np.ndarray = WHOLE
+    age: np.ndarray = WHOLE
+    start: np.ndarray = REAL
+    down: np.ndarray = REAL
+    milestone: np.ndarray = POINT
+    fell: np.ndarray = FLAG
+    stuck: np.ndarray = FLAG
+    duration: np.ndarray = REAL
+    stumbling: np.ndarray = REAL
 
 
 class Options(NamedTuple):
@@ -105,7 +98,6 @@ class Options(NamedTuple):
       action_scale: change of the parameters that actions set, per unit action, (k,).
       places: indices of these parameters, (k,).
       base_actions: parameters of the base actions, (B, P).
-      controls: addresses of the joints' torques in ctrl, (J,).
       fall, stumble: numbers of links whose ground contact is a fall, or reduces the reward.
       forward_only: whether moving backwards is a fall.
       backward_reward: whether the reward of a cycle with negative speed can be positive.
@@ -120,7 +112,6 @@ class Options(NamedTuple):
     action_scale: np.ndarray
     places: np.ndarray
     base_actions: np.ndarray
-    controls: np.ndarray
     fall: np.ndarray
     stumble: np.ndarray
     forward_only: bool
@@ -131,26 +122,20 @@ class Options(NamedTuple):
     pitch_rate: int
 
 
-class Rules(NamedTuple):
+class GaitData(NamedTuple):
     """Data for the compiled functions of gait tasks.
 
     Attributes:
-      ctrl: controls of the physics, (n, ...).
+      body: the body, which writes its blocks to `body.observation`, (n, ...).
       terms: the reward terms.
-      measured: blocks terrain, pose and velocity as `measure` writes them, (n, ...).
       interruption: why `go_on` returned last, (n,).
     """
 
-    engine: native.Engine
-    body: PlanarIds
-    ground: PlanarWindows
+    body: PlanarBodyData
     gait: GaitRules
-    ctrl: np.ndarray
     options: Options
     terms: Any
-    measured: np.ndarray
     interruption: np.ndarray
-    measurement: PlanarMeasurement
     state: GaitTaskState
     outcome: Outcome
 
@@ -159,23 +144,23 @@ class Rules(NamedTuple):
 
 
 @compiled
-def begin_step(i: int, action: np.ndarray, rules: Rules) -> None:
+def begin_step(i: int, action: np.ndarray, data: GaitData) -> None:
     """Begins a step; the action sets the gait of a cycle that begins with it."""
-    state = rules.state
+    state = data.state
     for k in range(state.action.shape[1]):
         state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
     state.lasted[i] = state.stumbled[i] = 0
     state.going[i] = True
-    state.start[i] = rules.gait.physics.subtree_com[i, rules.body.links[0], 0]
-    if rules.options.by_cycle or state.waiting[i]:
-        set_gait(i, rules)
+    state.start[i] = data.body.physics.subtree_com[i, data.body.ids.links[0], 0]
+    if data.options.by_cycle or state.waiting[i]:
+        set_gait(i, data)
 
 
 @compiled
-def set_gait(i: int, rules: Rules) -> None:
+def set_gait(i: int, data: GaitData) -> None:
     """Begins a cycle with the parameters of the current action."""
-    options, action, vector = rules.options, rules.state.action, rules.gait.state.vector
-    rules.state.waiting[i] = False
+    options, action, vector = data.options, data.state.action, data.gait.state.vector
+    data.state.waiting[i] = False
     if options.by_cycle:
         for k in range(len(options.action_offset)):
             vector[i, k] = options.action_offset[k]
@@ -188,45 +173,43 @@ def set_gait(i: int, rules: Rules) -> None:
                 choice = k
         for k in range(len(options.action_offset)):
             vector[i, k] = options.base_actions[choice, k]
-    gaits.apply(i, rules.gait)
+    gaits.apply(i, data.gait)
 
 
 @compiled
-def go_on(i: int, watched: bool, rules: Rules) -> int:
+def go_on(i: int, watched: bool, data: GaitData) -> int:
     """Continues a step until it is over or interrupted; returns the reason."""
-    state, options = rules.state, rules.options
+    state, options = data.state, data.options
     while state.going[i]:
-        if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
-            i, rules.body, rules.gait.physics, rules.ground
-        ):
+        if state.lasted[i] % _FRAME_STEPS == 0 and has_left(i, data.body):
             return _GROUND
-        gaits.act(i, rules.gait)
-        for k in range(len(options.controls)):
-            rules.ctrl[i, options.controls[k]] = rules.gait.scratch.torque[i, k]
-        native.step(i, options.substeps, rules.engine)
-        ended = gaits.advance(i, rules.gait)
-        account(i, rules)
+        gaits.act(i, data.gait)
+        for k in range(data.gait.scratch.torque.shape[1]):
+            data.body.ctrl[i, data.body.drive.first + k] = data.gait.scratch.torque[i, k]
+        native.step(i, options.substeps, data.body.engine)
+        ended = gaits.advance(i, data.gait)
+        account(i, data)
         if options.by_cycle:
             over = ended or state.lasted[i] == LONGEST_CYCLE * _FRAME_STEPS
         else:
             over = state.lasted[i] == _FRAME_STEPS
             if ended:
-                set_gait(i, rules)
-        state.going[i] = not (over or rules.outcome.failed[i])
+                set_gait(i, data)
+        state.going[i] = not (over or data.outcome.failed[i])
         if watched and i == 0 and state.age[i] % _FRAME_STEPS == 0:
             return _LOOK
     return _OVER
 
 
 @compiled
-def account(i: int, rules: Rules) -> None:
+def account(i: int, data: GaitData) -> None:
     """Updates times, stumbling and failure after a control step."""
-    state = rules.state
+    state = data.state
     state.lasted[i] += 1
     state.age[i] += 1
-    state.stumbled[i] += any_touches(i, rules.options.stumble, rules.gait)
+    state.stumbled[i] += any_touches(i, data.options.stumble, data.gait)
     if state.age[i] % _SAMPLE_STEPS == 0:
-        look(i, rules)
+        judge(i, data)
 
 
 @compiled
@@ -239,61 +222,45 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 
 
 @compiled
-def look(i: int, rules: Rules) -> None:
+def judge(i: int, data: GaitData) -> None:
     """Tests whether the episode has failed."""
-    state, body, physics = rules.state, rules.body, rules.gait.physics
-    state.down[i] *= CONTACT_DECAY
-    if any_touches(i, rules.options.fall, rules.gait):
-        state.down[i] += CONTACT_GAIN
-    pitch = physics.qpos[i, body.qpos[2]]
+    state, ids, physics = data.state, data.body.ids, data.body.physics
+    falls.sample(i, any_touches(i, data.options.fall, data.gait), state.down)
+    pitch = physics.qpos[i, ids.qpos[2]]
     turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
-    backwards = rules.options.forward_only and physics.qvel[i, body.dof[0]] < 0.0
-    state.fell[i] = state.down[i] > FALL_THRESHOLD or turn > TURNED or backwards
+    backwards = data.options.forward_only and physics.qvel[i, ids.dof[0]] < 0.0
+    state.fell[i] = state.down[i] > falls.THRESHOLD or turn > TURNED or backwards
     if state.age[i] % _PATIENCE_STEPS == 0:
-        x, z = physics.qpos[i, body.qpos[0]], physics.qpos[i, body.qpos[1]]
+        x, z = physics.qpos[i, ids.qpos[0]], physics.qpos[i, ids.qpos[1]]
         moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
         state.stuck[i] = moved < PROGRESS
         state.milestone[i, 0], state.milestone[i, 1] = x, z
-    diverged = breaks_down(i, rules)
-    rules.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
+    diverged = breaks_down(i, MAX_JOINT_SPEED, data.body)
+    data.outcome.diverged[i] = diverged  # keeps the last observation
+    data.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
 
 
 @compiled
-def breaks_down(i: int, rules: Rules) -> bool:
-    """Returns whether a simulation diverged or left its ground: it keeps the last observation."""
-    joints = rules.body.dof[3:]
-    diverged = (
-        native.diverged(i, rules.engine)
-        or native.too_fast(i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel)
-        or is_lost(i, rules.body, rules.gait.physics, rules.ground)
-    )
-    rules.outcome.diverged[i] = diverged
-    return diverged
-
-
-@compiled
-def finish_step(i: int, rules: Rules) -> None:
+def finish_step(i: int, data: GaitData) -> None:
     """Computes reward, failure and observation of a step that is over."""
-    state, outcome = rules.state, rules.outcome
+    state, outcome = data.state, data.outcome
     state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
     state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
-    outcome.diverged[i] |= native.diverged(i, rules.engine) or is_lost(
-        i, rules.body, rules.gait.physics, rules.ground
-    )
+    outcome.diverged[i] |= breaks_down(i, math.inf, data.body)
     failed = outcome.failed[i] or outcome.diverged[i]
     if outcome.diverged[i]:
         state.fell[i] = state.stuck[i] = False
     else:
-        reward(i, rules)
-        observe(i, rules)
+        reward(i, data)
+        observe(i, data)
     conclude(i, failed, outcome)
 
 
 @compiled
-def reward(i: int, rules: Rules) -> None:
+def reward(i: int, data: GaitData) -> None:
     """Writes the reward terms, from mean speed and stumbling time of the cycle."""
-    state, options, terms, outcome = rules.state, rules.options, rules.terms, rules.outcome
-    travelled = rules.gait.physics.subtree_com[i, rules.body.links[0], 0] - state.start[i]
+    state, options, terms, outcome = data.state, data.options, data.terms, data.outcome
+    travelled = data.body.physics.subtree_com[i, data.body.ids.links[0], 0] - state.start[i]
     speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
     off = speed - options.target_speed
     share = state.stumbled[i] / state.lasted[i]
@@ -307,24 +274,25 @@ def reward(i: int, rules: Rules) -> None:
 
 
 @compiled
-def observe(i: int, rules: Rules) -> None:
+def observe(i: int, data: GaitData) -> None:
     """Writes the observation, with the stance leg first."""
-    options, body, physics = rules.options, rules.body, rules.gait.physics
-    measured, observation = rules.measured, rules.outcome.observation
-    measure(i, body, physics, rules.ground, measured, rules.measurement)
-    stance = rules.gait.state.stance[i]
+    options, ids, physics = data.options, data.body.ids, data.body.physics
+    measured, observation = data.body.observation, data.outcome.observation
+    measure(i, data.body)
+    observe_body(i, data.body.columns, data.body, measured)
+    stance = data.gait.state.stance[i]
     for k in range(options.columns.shape[1]):
         observation[i, k] = measured[i, options.columns[stance, k]]
     if options.pitch >= 0:
-        observation[i, options.pitch] = physics.qpos[i, body.qpos[2]]
-        observation[i, options.pitch_rate] = physics.qvel[i, body.dof[2]]
+        observation[i, options.pitch] = physics.qpos[i, ids.qpos[2]]
+        observation[i, options.pitch_rate] = physics.qvel[i, ids.dof[2]]
 
 
 def observed_blocks(
     measured: tuple[Block, ...], spec: CharacterSpec, parameters: Parameters
 ) -> tuple[Block, ...]:
     """Returns the blocks that `observe` writes, from those that `measure` writes."""
-    terrain, pose, velocity = measured
+    terrain, pose, velocity, _ = measured
     stance = '; the stance leg first, then the swing leg' if spec.mirror else ''
     pitch = stance or '; the last z is replaced by the pitch of the root (rad)'
     rate = stance or '; the last z is replaced by the pitch rate of the root (rad/s)'
@@ -341,50 +309,50 @@ def observed_blocks(
 
 
 @compiled
-def begin_episode(i: int, rules: Rules) -> None:
+def begin_episode(i: int, data: GaitData) -> None:
     """Resets state machine, outcome and state of the task."""
-    state, body, physics = rules.state, rules.body, rules.gait.physics
-    gaits.begin(i, rules.options.action_offset, rules.gait)
-    begin(i, rules.outcome)
+    state, ids, physics = data.state, data.body.ids, data.body.physics
+    gaits.begin(i, data.options.action_offset, data.gait)
+    begin(i, data.outcome)
     state.going[i], state.waiting[i] = False, True
     state.lasted[i] = state.stumbled[i] = state.age[i] = 0
     state.down[i] = state.duration[i] = state.stumbling[i] = 0.0
     state.fell[i] = state.stuck[i] = False
-    state.milestone[i, 0] = physics.qpos[i, body.qpos[0]]
-    state.milestone[i, 1] = physics.qpos[i, body.qpos[1]]
+    state.milestone[i, 0] = physics.qpos[i, ids.qpos[0]]
+    state.milestone[i, 1] = physics.qpos[i, ids.qpos[1]]
 
 
 # Loops over simulations; they take packs.
 
 
 @compiled
-def begin_steps(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> None:
+def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitData) -> None:
     """Begins steps."""
     for i in env_ids:
-        begin_step(i, action, rules)
+        begin_step(i, action, data)
 
 
 @compiled
-def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
+def run(env_ids: np.ndarray, watched: bool, data: GaitData) -> int:
     """Continues steps; returns how many were interrupted."""
     interrupted = 0
     for i in env_ids:
-        rules.interruption[i] = go_on(i, watched, rules)
-        interrupted += rules.interruption[i] != _OVER
+        data.interruption[i] = go_on(i, watched, data)
+        interrupted += data.interruption[i] != _OVER
     return interrupted
 
 
 @compiled
-def finish_steps(env_ids: np.ndarray, rules: Rules) -> None:
+def finish_steps(env_ids: np.ndarray, data: GaitData) -> None:
     """Finishes steps."""
     for i in env_ids:
-        finish_step(i, rules)
+        finish_step(i, data)
 
 
 @compiled
-def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> None:
+def observe_all(env_ids: np.ndarray, fresh: bool, data: GaitData) -> None:
     """Writes observations; if `fresh`, episodes have just begun, and their state is reset."""
     for i in env_ids:
         if fresh:
-            begin_episode(i, rules)
-        observe(i, rules)
+            begin_episode(i, data)
+        observe(i, data)

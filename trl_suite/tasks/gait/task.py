@@ -16,14 +16,13 @@ import numpy as np
 from trl_suite import actuation
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import PlanarArena
+from trl_suite.bodies.planar import PlanarBody
+from trl_suite.bodies.reference import link_extents
+from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import layout
-from trl_suite.kinematics.planar import PlanarIds
-from trl_suite.kinematics.planar_figure import PlanarFigure
-from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.gait.rules import (
     _GROUND,
     _LOOK,
@@ -35,9 +34,9 @@ from trl_suite.tasks.gait.rules import (
     SUBSTEPS,
     TERMS,
     UPSTREAM_CENTRE,
+    GaitData,
     GaitTaskState,
     Options,
-    Rules,
     begin_steps,
     finish_steps,
     observe_all,
@@ -128,13 +127,13 @@ class GaitTask(Task):
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
         self.steps_vary = interface == 'parameters'
-        self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
+        self.figure = PlanarBody(character, arena, BEHIND, AHEAD, SAMPLES)
         parameters = load(character.spec.name, config.base_actions)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
         timestep = CONTROL_TIMESTEP / config.substeps
         self.set_timesteps(FRAME, timestep)
-        actuation.add(character, 'torque', timestep)
+        self._torques = actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned for joints without these
             joint.damping = joint.armature = 0
         if interface == 'parameters':
@@ -169,24 +168,10 @@ class GaitTask(Task):
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure, gait = self.figure, self.gait
-        figure.bind(world, layout(figure.blocks))
+        measured = np.zeros((n, sum(block.size for block in figure.blocks)))
+        figure.bind(world, self._torques, measured, figure.blocks)
         gait.bind(world)
-        options = self._options(figure.body)
-        self.state = GaitTaskState(
-            action=np.zeros((n, len(self.action_map))),
-            going=np.zeros(n, bool),
-            waiting=np.zeros(n, bool),
-            lasted=np.zeros(n, int),
-            stumbled=np.zeros(n, int),
-            age=np.zeros(n, int),
-            start=np.zeros(n),
-            down=np.zeros(n),
-            milestone=np.zeros((n, 2)),
-            fell=np.zeros(n, bool),
-            stuck=np.zeros(n, bool),
-            duration=np.zeros(n),
-            stumbling=np.zeros(n),
-        )
+        self.state = allocated(GaitTaskState, n, action=np.zeros(len(self.action_map)))
         self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
         self.saved = (self.state, gait.state, self.outcome)
         self.info_arrays |= {
@@ -195,27 +180,20 @@ class GaitTask(Task):
             'duration': self.state.duration,
             'stumbled': self.state.stumbling,
         }
-        self.rules = Rules(
-            engine=world.engine,
-            body=figure.body,
-            ground=figure.ground,
+        self.data = GaitData(
+            body=figure.data,
             gait=gait.rules,
-            ctrl=world.ctrl,
-            options=options,
+            options=self._options(),
             terms=terms_data(self.terms),
-            measured=np.zeros((n, sum(block.size for block in figure.blocks))),
             interruption=np.zeros(n, int),
-            measurement=figure.measurement,
             state=self.state,
             outcome=self.outcome,
         )
-        self._pack = packed(self.rules)
+        self._pack = packed(self.data)
         self._start = self._start_pose()
 
-    def _options(self, body: PlanarIds) -> Options:
+    def _options(self) -> Options:
         parameters, spec = self.gait.parameters, self.character.spec
-        scope = f'{self.character.mjcf_model.model}/'
-        controls = self.world.control_addresses([scope + name for name in spec.joints])
         fall = [self.gait.link[name] for name in spec.fall_links]
         stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
         pitch = parameters.observe_pitch
@@ -226,20 +204,19 @@ class GaitTask(Task):
             action_scale=parameters.action_scale[parameters.actions],
             places=parameters.actions,
             base_actions=parameters.base_actions,
-            controls=controls,
             fall=np.array(fall),
             stumble=np.array(stumble),
             forward_only=parameters.forward_only,
             backward_reward=parameters.backward_reward,
             target_speed=float(parameters.target_speed),
-            columns=self._columns(body),
+            columns=self._columns(),
             pitch=self.blocks['pose'].stop - 1 if pitch else -1,
             pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
         )
 
-    def _columns(self, body: PlanarIds) -> np.ndarray:
-        """Returns the columns of the measurement in an observation, by stance leg, (2, size)."""
-        links = self.character.spec.links
+    def _columns(self) -> np.ndarray:
+        """Returns the columns of the body's blocks in an observation, by stance leg, (2, size)."""
+        links, body = self.character.spec.links, self.figure.data.columns
         order = np.arange(len(links))
         mirrored = order.copy()
         for right, left in self.character.spec.mirror:
@@ -248,10 +225,10 @@ class GaitTask(Task):
         arranged = []
         for each in (order, mirrored):
             pairs = 2 * each[:, None] + np.arange(2)
-            arranged.append(np.concatenate([
-                np.arange(SAMPLES) + body.terrain, [body.pose],
-                (pairs[1:] + body.pose + 1).ravel(), (pairs + body.velocity).ravel(),
-            ]))  # fmt: skip
+            pose, velocity = pairs[1:] + body.pose + 1, pairs + body.velocity
+            terrain = np.arange(SAMPLES) + body.terrain
+            parts = terrain, [body.pose], pose.ravel(), velocity.ravel()
+            arranged.append(np.concatenate(parts))
         return np.array(arranged)
 
     def _start_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -283,6 +260,7 @@ class GaitTask(Task):
                 centre=UPSTREAM_CENTRE,
             )
             self.arena.begin_episode(i, strip)
+        self.world.reset(env_ids)
         self.figure.place(env_ids, poses, rates, extents)
         self._observe(env_ids, True)
 
@@ -291,7 +269,7 @@ class GaitTask(Task):
 
     def simulate(self, env_ids: np.ndarray) -> None:
         """Runs each simulation to the end of its cycle, or for 1/30 s."""
-        interruption = self.rules.interruption
+        interruption = self.data.interruption
         while run(env_ids, self.watch is not None, self._pack):
             leaving = env_ids[interruption[env_ids] == _GROUND]
             if len(leaving):

@@ -4,8 +4,12 @@ from trl_suite.motion import Clip
 from trl_suite.tasks.common import differences
 from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.imitation.description import IMITATION
-from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
-from trl_suite.tasks.imitation.spatial import SpatialImitation, SpatialImitationConfig
+from trl_suite.tasks.imitation.task import (
+    PlanarImitation,
+    PlanarImitationConfig,
+    SpatialImitation,
+    SpatialImitationConfig,
+)
 from trl_suite.tasks.task_type import TaskType, tracking
 
 TYPES = (

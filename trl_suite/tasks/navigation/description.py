@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from trl_suite.tasks.common import ball, description, spatial_description
+from trl_suite.tasks.common import ball, description, falls, spatial_description
 from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
 from trl_suite.tasks.navigation import direct, hierarchical_rules
@@ -65,16 +65,9 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
         full = f'the term speed is at its maximum if the step begins within {task.goal_reached:g} m of the goal'
     yield description.reward(task, f'target speed: {task.config.target_speed:g} m/s', full)
     every = hierarchical_rules.SAMPLE_FRAMES / 30
-    share = (
-        hierarchical_rules.FALL_THRESHOLD,
-        hierarchical_rules.CONTACT_DECAY,
-        hierarchical_rules.CONTACT_GAIN,
-    )
     yield section(
         f'Termination (discount 0), sampled every {every:g} s',
-        f'one of {", ".join(task.character.spec.fall_links)} touches the ground in '
-        f'{description.samples_until_fall(*share)} consecutive samples, or so often that {description.contact_share(*share)}; '
-        'or the physics diverges',
+        f'one of {", ".join(task.character.spec.fall_links)} {falls.condition()}; or the physics diverges',
     )
 
 

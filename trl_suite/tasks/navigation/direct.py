@@ -14,17 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
+from trl_suite.bodies.reference import Reference, moment
+from trl_suite.bodies.spatial import SpatialState
+from trl_suite.bodies.state import REAL, allocated
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
-from trl_suite.kinematics.spatial_reference import SpatialReference, moment
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks.common.ball import (
     BALL,
     BALL_GOAL,
     SPEED,
     Ball,
-    BallRules,
+    BallData,
     dribble,
     goal_disc,
     no_ball,
@@ -32,34 +33,29 @@ from trl_suite.tasks.common.ball import (
     remember,
     soccer_terms,
 )
-from trl_suite.tasks.common.comparison import (
-    Comparison,
+from trl_suite.tasks.common.control import HEIGHT_MAP, SpatialConfig, check_cycle, cycle_poses
+from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag
+from trl_suite.tasks.common.plans import Plans
+from trl_suite.tasks.common.rewards import (
     com_error,
-    comparison,
     effector_error,
     motion_errors,
-)
-from trl_suite.tasks.common.goal_drawer import GoalDrawer
-from trl_suite.tasks.common.goals import GOAL, Goals, flag, goals
-from trl_suite.tasks.common.plans import Plans
-from trl_suite.tasks.common.rewards import score_tracking, tracking_terms
-from trl_suite.tasks.common.spatial_rules import (
-    HEIGHT_MAP,
-    Clock,
-    Travel,
-    View,
-    look_and_travel,
-    observe_body,
-    observe_phase,
-    publish,
-    tick,
+    score_tracking,
+    tracking_terms,
 )
 from trl_suite.tasks.common.trace import Trace, follow, trace, trace_markers
-from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
-from trl_suite.tasks.imitation.spatial import check_cycle, clip_action, cycle_poses, pose_of_clip
-from trl_suite.tasks.spatial_task import SpatialConfig, TrackingTask
+from trl_suite.tasks.common.tracking_rules import (
+    TrackingData,
+    go,
+    observe_phase,
+    observe_place,
+    proceed,
+    publish,
+)
+from trl_suite.tasks.footsteps.task import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
-from trl_suite.tasks.terms import Outcome, Term, conclude, facing, give, score, wrapped
+from trl_suite.tasks.terms import Term, conclude, facing, give, score, wrapped
+from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Range, option
 
@@ -94,52 +90,45 @@ def direct_terms(share: float, where: str) -> tuple[Term, ...]:
 class Progress(NamedTuple):
     """Speed of each walker's centre of mass towards its goal, (n,) m/s."""
 
-    speed: np.ndarray
+    speed: np.ndarray = REAL
 
 
 class DirectData(NamedTuple):
     """Data for the compiled functions of direct navigation.
 
     Attributes:
-      period: that of the clip, s.
+      tracking: data of every tracking task; the period is that of the clip.
+      physics: state of the physics.
       goal_reached: distance of the root within which the goal is reached, m.
       with_ball: whether the goal is that of a ball.
     """
 
-    body: SpatialBodyData
-    outcome: Outcome
-    given: View
-    clock: Clock
-    travel: Travel
-    period: float
-    comparison: Comparison
+    tracking: TrackingData
+    physics: SpatialState
     goals: Goals
     progress: Progress
     trace: Trace
     goal_reached: float
     with_ball: bool
-    ball: BallRules
+    ball: BallData
 
 
-# A step of simulation i: `advance`, the next goal if one is needed, `finish`.
+# A step of simulation i, after the body was measured: `advance`, the next goal if one is needed,
+# `finish`.
 
 
 @compiled
 def advance(i: int, data: DirectData) -> bool:
-    """Measures the body and tests goal and ball; returns whether one of them must be redrawn."""
-    body, goals, state = data.body, data.goals, data.ball.state
-    tick(i, data.period, data.clock)
+    """Tests goal and ball; returns whether one of them must be redrawn."""
+    tracking, goals, state = data.tracking, data.goals, data.ball.state
     goals.wanted[i] = state.wanted[i] = False
-    data.outcome.diverged[i] = breaks_down(i, body)
-    if data.outcome.diverged[i]:
+    if not proceed(i, tracking):
         return False
-    look_and_travel(i, body, data.travel)
-    count, measurement = data.clock.steps[i], body.measurement
+    count, measurement = tracking.clock.steps[i], tracking.measurement
     follow(i, count, measurement.com, data.trace)
     if data.with_ball:
-        dribble(
-            i, CONTROL_TIMESTEP, goals.place, body.physics, measurement, data.ball, data.outcome
-        )
+        seconds, ball, outcome = CONTROL_TIMESTEP, data.ball, tracking.outcome
+        dribble(i, seconds, goals.place, data.physics, measurement, ball, outcome)
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
         goals.wanted[i] = count >= goals.due[i]  # a ball's goal is not redrawn when it is reached
@@ -155,24 +144,25 @@ def advance(i: int, data: DirectData) -> bool:
 @compiled
 def finish(i: int, data: DirectData) -> None:
     """Computes reward, failure and observation."""
-    body = data.body
-    if data.outcome.diverged[i]:  # keeps the last finite observation
-        conclude(i, True, data.outcome)
+    tracking = data.tracking
+    if tracking.outcome.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, tracking.outcome)
         return
     if data.with_ball:
-        remember(i, body.physics, body.measurement, data.ball)
+        remember(i, data.physics, tracking.measurement, data.ball)
     compare(i, data)
-    conclude(i, body.measurement.fallen[i], data.outcome)
+    conclude(i, tracking.measurement.fallen[i], tracking.outcome)
     observe(i, data)
 
 
 @compiled
 def compare(i: int, data: DirectData) -> None:
     """Writes the reward terms: imitation while walking to the goal, or to the ball."""
-    body, comparison, measurement = data.body, data.comparison, data.body.measurement
-    row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
+    tracking, comparison = data.tracking, data.tracking.comparison
+    measurement = tracking.measurement
+    row, fraction = moment(tracking.clock.phase[i], 0, comparison.tracks)
     if data.with_ball:
-        qpos, first = body.physics.qpos, data.ball.qpos
+        qpos, first = data.physics.qpos, data.ball.qpos
         x, y = qpos[i, first], qpos[i, first + 1]
     else:
         x, y = data.goals.place[i, 0], data.goals.place[i, 1]
@@ -184,7 +174,7 @@ def compare(i: int, data: DirectData) -> None:
     off = 0.0 if near else wrapped(direction - measurement.heading[i])
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
-    terms, outcome = comparison.terms, data.outcome
+    terms, outcome = comparison.terms, tracking.outcome
     score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
     give(i, facing(off), terms.heading, outcome)
     score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
@@ -194,17 +184,16 @@ def compare(i: int, data: DirectData) -> None:
 
 @compiled
 def observe(i: int, data: DirectData) -> None:
-    """Writes the observation."""
-    body, columns, full = data.body, data.given.columns, data.given.full
-    measurement, place = body.measurement, data.goals.place
-    observe_body(i, columns, body, full)
-    observe_phase(i, columns, data.clock, full)
+    """Writes the blocks after those of the body: phase, goal and ball."""
+    tracking, place = data.tracking, data.goals.place
+    columns, full, measurement = tracking.given.columns, tracking.given.full, tracking.measurement
+    observe_phase(i, columns, tracking.clock, full)
     if data.with_ball:
-        observe_ball(i, columns, place, body.physics, measurement, data.ball, full)
+        observe_ball(i, columns, place, data.physics, measurement, data.ball, full)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
-        full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.given, data.outcome)
+        observe_place(i, columns.goal, x, y, measurement, full)
+    publish(i, tracking.given, tracking.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -228,14 +217,15 @@ def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
 
 @compiled
 def observe_all(env_ids: np.ndarray, fresh: bool, data: DirectData) -> None:
-    """Measures, writes reward terms for the current state, and observes.
+    """Writes distances, reward terms of the current state, and observations.
 
     If `fresh`, episodes have just begun, and positions of ball and body are stored.
     """
     for i in env_ids:
-        look_and_travel(i, data.body, data.travel)
+        tracking = data.tracking
+        go(i, tracking.along, tracking.measurement, tracking.travel)
         if fresh and data.with_ball:
-            remember(i, data.body.physics, data.body.measurement, data.ball)
+            remember(i, data.physics, tracking.measurement, data.ball)
         compare(i, data)
         observe(i, data)
 
@@ -312,18 +302,26 @@ class DirectNavigation(TrackingTask):
         self.goal_reached = GOAL_REACHED if reached is None else float(reached)
         self._goal_drawer = GoalDrawer(arena, ball, 'near')
         super().__init__(
-            character, arena, clip, cycle_poses(clip), config, period=clip.duration,
+            character,
+            arena,
+            clip,
+            cycle_poses(clip),
+            config,
+            period=clip.duration,
             actuation_model=actuation_model,
             extras=(BALL_GOAL if ball else GOAL, BALL.observed_if(ball is not None)),
-        )  # fmt: skip
+        )
 
     def bind(self, world: World) -> None:
-        view, n = self._bind_view(world), world.n
-        self.reference = SpatialReference.of_clip(self.clip, self.figure.body, world.models[0])
-        self.goals, self.progress, self.trace = goals(n), Progress(np.zeros(n)), trace(n)
+        tracking, n = self._bind_tracking(world), world.n
+        self.goals, self.progress, self.trace = (
+            allocated(Goals, n),
+            allocated(Progress, n),
+            trace(n),
+        )
         self.saved = (*self.saved, self.goals, self.progress, self.trace)
         self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
-        self._goal_drawer.bind(world, self.goals, self.clock, self._random)
+        self._goal_drawer.bind(world, self.goals, self.clock.steps, self._random)
         balls = no_ball(n)
         if self.ball:
             self.ball.bind(world)
@@ -331,13 +329,8 @@ class DirectNavigation(TrackingTask):
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         data = DirectData(
-            body=self.figure.data,
-            outcome=self.outcome,
-            given=view,
-            clock=self.clock,
-            travel=self.travel,
-            period=self.period,
-            comparison=comparison(self.character, self.reference, self.terms),
+            tracking=tracking,
+            physics=self.figure.data.physics,
             goals=self.goals,
             progress=self.progress,
             trace=self.trace,
@@ -354,11 +347,13 @@ class DirectNavigation(TrackingTask):
 
     # Episodes.
 
+    def _track(self) -> Reference:
+        return Reference.of_clip(self.clip, self.figure, self.world.models[0])
+
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = self._begin_grounds(env_ids, random_states)
-        return *pose_of_clip(self.clip, self.clock.start[env_ids]), spawns
+        return self._clip_start(env_ids, self._begin_grounds(env_ids, random_states))
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         self.goals.reached[env_ids] = 0
@@ -368,21 +363,21 @@ class DirectNavigation(TrackingTask):
         if self.ball:
             self.ball.state.at_goal[env_ids] = False
             self.world.forward(env_ids)
+        self.figure.measure(env_ids)
         observe_all(env_ids, True, self._pack)
 
     # A step.
 
     def finish_step(self, env_ids: np.ndarray) -> None:
+        measurement = self.figure.measure(env_ids, stepped=True)
         if advance_all(env_ids, self._pack):
-            self._goal_drawer.redraw(env_ids, self.figure.measurement.root[:, :2])
+            self._goal_drawer.redraw(env_ids, measurement.root[:, :2])
         finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        observe_all(self.world.all_ids if env_ids is None else env_ids, False, self._pack)
-
-    def clip_action(self, env_id: int) -> np.ndarray:
-        """Returns the action that moves the joints along the clip, in open loop."""
-        return clip_action(self, self.clip, env_id)
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        self.figure.measure(env_ids)
+        observe_all(env_ids, False, self._pack)
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of past positions of the centre of mass, and of the goal."""

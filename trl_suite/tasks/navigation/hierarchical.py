@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
+from trl_suite.bodies.blocks import Block, columns, layout
+from trl_suite.bodies.spatial import body_blocks
+from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import Block, columns, layout
-from trl_suite.kinematics.spatial_figure import body_blocks
 from trl_suite.motion import FootstepLibrary
 from trl_suite.tasks.common.ball import (
     AT_GOAL,
@@ -28,22 +29,20 @@ from trl_suite.tasks.common.ball import (
     no_ball,
     soccer_terms,
 )
+from trl_suite.tasks.common.control import maps
 from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
+    FootstepPlan,
+    Planned,
     check_two_feet,
-    footstep_plan,
     plan_markers,
 )
-from trl_suite.tasks.common.goal_drawer import GoalDrawer
-from trl_suite.tasks.common.goals import GOAL, flag, goals
+from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag
 from trl_suite.tasks.common.plans import Plans
-from trl_suite.tasks.common.spatial_rules import (
-    PHASE,
-    TERRAIN_MAPS,
-)
 from trl_suite.tasks.common.trace import trace, trace_markers
+from trl_suite.tasks.common.tracking_rules import PHASE
 from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,
@@ -68,7 +67,6 @@ from trl_suite.tasks.navigation.plan_actions import (
     plan_action_map,
     planning_mirror,
 )
-from trl_suite.tasks.spatial_task import SpatialTask, maps
 from trl_suite.tasks.task import (
     CONTROL_TIMESTEP,
     MOST_SUBSTEPS,
@@ -79,9 +77,12 @@ from trl_suite.tasks.task import (
     drawn_seed,
 )
 from trl_suite.tasks.terms import terms_data
+from trl_suite.tasks.tracking import ClockedTask
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, Range, option
+
+TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +141,7 @@ class HierarchicalConfig(Config):
         self._set('terrain_observation', maps(self.terrain_observation))
 
 
-class HierarchicalNavigation(SpatialTask):
+class HierarchicalNavigation(Planned, ClockedTask):
     """A spatial biped walks from goal to goal, or dribbles a ball to them, by planning footsteps.
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
@@ -182,10 +183,8 @@ class HierarchicalNavigation(SpatialTask):
         self.steps, self.ball = steps, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
         self.terms = soccer_terms() if ball else NAVIGATION_TERMS
-        super().__init__(
-            character, arena, steps, typical_poses(steps, self._first), config,
-            period=2 * steps.duration,
-        )  # fmt: skip
+        typical = typical_poses(steps, self._first)
+        super().__init__(character, arena, steps, typical, config, period=2 * steps.duration)
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
         blocks = *self.figure.blocks, PHASE, CONTACT, PLAN
@@ -227,13 +226,10 @@ class HierarchicalNavigation(SpatialTask):
         return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
 
     def bind(self, world: World) -> None:
-        self._bind_walker(world)
+        self._bind_clock(world)
         n = world.n
-        self.plan, self.goals, self.trace = footstep_plan(n), goals(n), trace(n)
-        self.state = PlanningState(
-            np.zeros(n, int), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
-            np.zeros(n, bool),
-        )  # fmt: skip
+        self.plan, self.goals = allocated(FootstepPlan, n), allocated(Goals, n)
+        self.state, self.trace = allocated(PlanningState, n), trace(n)
         self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
         self.info_arrays |= {
             'landed': self.plan.landed,
@@ -243,18 +239,18 @@ class HierarchicalNavigation(SpatialTask):
             'speed': self.state.speed,
             'duration': self.state.duration,
         }
-        self._goal_drawer.bind(world, self.goals, self.clock, self._random)
+        self._goal_drawer.bind(world, self.goals, self.clock.steps, self._random)
         balls = no_ball(n)
         if self.ball:
             self.ball.bind(world)
             balls = self.ball.rules(float(self.config.target_speed), self.goal_reached, self.terms)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        observed = ControllerData(
-            columns(self._controller_blocks),
-            np.zeros((n, sum(block.size for block in self._controller_blocks))),
-        )
-        self._controller_observation = observed.observation
+        blocks = self._controller_blocks
+        observation = np.zeros((n, sum(block.size for block in blocks)))
+        self.figure.bind(world, self.joint_map, observation, blocks, self.ABOUT)
+        observed = ControllerData(columns(blocks), observation)
+        self._controller_observation = observation
         self._joint_action = np.zeros((n, len(self.joint_map)))
         self._pack = packed(
             PlanningData(
@@ -280,23 +276,6 @@ class HierarchicalNavigation(SpatialTask):
             )
         )
 
-    # Short names for state.
-
-    @property
-    def stance(self) -> np.ndarray:
-        """Stance foot, 0 right, 1 left, (n,)."""
-        return self.plan.stance
-
-    @property
-    def landing(self) -> np.ndarray:
-        """Landing places of the swing foot, then of the stance foot, (n, 2, 3) m."""
-        return self.plan.landing
-
-    @property
-    def heading(self) -> np.ndarray:
-        """Planned heading, (n,) rad."""
-        return self.plan.heading
-
     @property
     def goal(self) -> np.ndarray:
         """Goal of the walker, or of the ball, (n, 3) m."""
@@ -318,6 +297,7 @@ class HierarchicalNavigation(SpatialTask):
             self.clock.start[i] = random.choice(self.config.start_phases)
             spawns[k] = ground.spawn(random)
             self.arena.begin_episode(i, ground, spawns[k, :2])
+        self.travel.origin[env_ids] = spawns
         self._begin_clocks(env_ids)
         self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
         return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns

@@ -7,30 +7,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.blocks import HEIGHTS, Block, Reflection
-from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
-from trl_suite.kinematics.spatial_figure import LINES
-from trl_suite.tasks.common.ball import (
-    BallRules,
-    dribble,
-    observe_ball,
-    remember,
+from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
+from trl_suite.bodies.body import MAX_JOINT_SPEED
+from trl_suite.bodies.spatial import (
+    LINES,
+    SpatialBodyData,
+    breaks_down,
+    measure,
+    observe_body,
 )
-from trl_suite.tasks.common.footstep_plan import (
-    FootstepPlan,
-    observe_plan,
-    update_stance,
-)
+from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE
+from trl_suite.tasks.common import falls
+from trl_suite.tasks.common.ball import BallData, dribble, observe_ball, remember
+from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import Goals
-from trl_suite.tasks.common.spatial_rules import (
+from trl_suite.tasks.common.trace import Trace, follow
+from trl_suite.tasks.common.tracking_rules import (
     Clock,
     Travel,
-    look_and_travel,
-    observe_body,
+    go,
     observe_phase,
+    observe_place,
     tick,
 )
-from trl_suite.tasks.common.trace import Trace, follow
 from trl_suite.tasks.task import CONTROL_TIMESTEP
 from trl_suite.tasks.terms import Outcome, Term, conclude, give
 from trl_suite.terrain.spatial import windows as spatial_ground
@@ -60,11 +59,6 @@ SURFACE = Block(
         np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)
     ),
 )  # fmt: skip
-CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
-    0.9,
-    1 / 11,
-    0.25,
-)  # of the decaying average of samples with a fall link on the ground
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
 FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 LONGEST = 60  # limit of control steps per step; the clock switches stance long before
@@ -82,12 +76,12 @@ class PlanningState(NamedTuple):
       over: whether the step is over.
     """
 
-    lasted: np.ndarray
-    duration: np.ndarray
-    begin: np.ndarray
-    down: np.ndarray
-    speed: np.ndarray
-    over: np.ndarray
+    lasted: np.ndarray = WHOLE
+    duration: np.ndarray = REAL
+    begin: np.ndarray = PLACE
+    down: np.ndarray = REAL
+    speed: np.ndarray = REAL
+    over: np.ndarray = FLAG
 
 
 class ControllerData(NamedTuple):
@@ -129,7 +123,7 @@ class PlanningData(NamedTuple):
     target_speed: float
     goal_reached: float
     with_ball: bool
-    ball: BallRules
+    ball: BallData
 
 
 # A step of simulation i: `begin_step`; then for every control step the action of the footstep
@@ -141,7 +135,7 @@ class PlanningData(NamedTuple):
 def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan if a footstep begins, and writes the footstep controller's observation."""
     body, state = data.body, data.state
-    look_and_travel(i, body, data.travel)
+    look(i, data)
     lay_plan(i, action, data)
     state.lasted[i] = 0
     for k in range(3):
@@ -150,6 +144,13 @@ def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
         remember(i, body.physics, body.measurement, data.ball)
     data.plan.landed[i] = False
     observe_for_controller(i, data)
+
+
+@compiled
+def look(i: int, data: PlanningData) -> None:
+    """Measures the body and its distance from the start."""
+    measure(i, data.body)
+    go(i, False, data.body.measurement, data.travel)
 
 
 @compiled
@@ -194,16 +195,15 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     body, state, outcome, plan = data.body, data.state, data.outcome, data.plan
     tick(i, data.period, data.clock)
     state.lasted[i] += 1
-    data.outcome.diverged[i] = breaks_down(i, body)
+    data.outcome.diverged[i] = breaks_down(i, MAX_JOINT_SPEED, body)
     if data.outcome.diverged[i]:
         outcome.failed[i] = state.over[i] = True
         return False
-    look_and_travel(i, body, data.travel)
+    look(i, data)
     count, measurement = data.clock.steps[i], body.measurement
     if count % SAMPLE_FRAMES == 0:
-        state.down[i] *= CONTACT_DECAY
-        state.down[i] += CONTACT_GAIN * measurement.fallen[i]
-    outcome.failed[i] = state.down[i] > FALL_THRESHOLD
+        falls.sample(i, measurement.fallen[i], state.down)
+    outcome.failed[i] = state.down[i] > falls.THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
     follow(i, count, measurement.com, data.trace)
@@ -226,16 +226,13 @@ def score(i: int, data: PlanningData) -> bool:
     if outcome.diverged[i]:
         return False
     if data.with_ball:
-        state.speed[i] = dribble(
-            i, seconds, goals.place, body.physics, measurement, data.ball, outcome
-        )
+        balls, place = data.ball, goals.place
+        state.speed[i] = dribble(i, seconds, place, body.physics, measurement, balls, outcome)
     else:
         x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
         distance = math.hypot(x, y)
-        moved_x, moved_y = (
-            measurement.com[i, 0] - state.begin[i, 0],
-            measurement.com[i, 1] - state.begin[i, 1],
-        )
+        moved_x = measurement.com[i, 0] - state.begin[i, 0]
+        moved_y = measurement.com[i, 1] - state.begin[i, 1]
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
         lack = min(speed - data.target_speed, 0.0)
         full = distance < data.goal_reached
@@ -251,10 +248,8 @@ def score(i: int, data: PlanningData) -> bool:
         goals.reached[i] += ball.at_goal[i]
         ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
     else:
-        x, y = (
-            goals.place[i, 0] - measurement.root[i, 0],
-            goals.place[i, 1] - measurement.root[i, 1],
-        )
+        x = goals.place[i, 0] - measurement.root[i, 0]
+        y = goals.place[i, 1] - measurement.root[i, 1]
         reached = math.hypot(x, y) < data.goal_reached
         goals.reached[i] += reached
         goals.wanted[i] = reached or late
@@ -284,8 +279,7 @@ def observe(i: int, data: PlanningData) -> None:
         observe_ball(i, columns, place, body.physics, measurement, data.ball, observation)
     else:
         x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
-        bearing, distance = polar(i, x, y, measurement)
-        observation[i, columns.goal], observation[i, columns.goal + 1] = bearing, distance
+        observe_place(i, columns.goal, x, y, measurement, observation)
     if columns.low_level >= 0:
         observe_for_controller(i, data)
         for k in range(data.controller.observation.shape[1]):
@@ -306,7 +300,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
 def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
-        look_and_travel(i, data.body, data.travel)
+        look(i, data)
         lay_plan(i, action, data)
         observe_for_controller(i, data)
         observe(i, data)
@@ -341,5 +335,5 @@ def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
 def observe_all(env_ids: np.ndarray, data: PlanningData) -> None:
     """Observes."""
     for i in env_ids:
-        look_and_travel(i, data.body, data.travel)
+        look(i, data)
         observe(i, data)

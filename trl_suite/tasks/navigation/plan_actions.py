@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap
+from trl_suite.bodies.blocks import Block, layout, reflected, signs
+from trl_suite.bodies.spatial import LINK_POSE
 from trl_suite.characters import Character
-from trl_suite.kinematics.blocks import Block, layout, reflected, signs
-from trl_suite.kinematics.spatial import LINK_POSE
 from trl_suite.policies.mirror import Mirror
 
 INTERFACES = ('plan', 'frame')

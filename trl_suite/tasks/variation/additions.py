@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import Block
+from trl_suite.bodies.blocks import Block
 from trl_suite.tasks.component import Component
 from trl_suite.tasks.terms import Outcome
 from trl_suite.util import errors

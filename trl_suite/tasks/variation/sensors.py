@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.bodies.blocks import LEVELS, Block, layout
 from trl_suite.engine import World
-from trl_suite.kinematics.blocks import LEVELS, Block, layout
 from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.terms import Outcome

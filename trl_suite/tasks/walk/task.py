@@ -12,23 +12,17 @@ import numpy as np
 
 from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.bodies.blocks import Block, Noise, columns
+from trl_suite.bodies.body import Measurement
+from trl_suite.bodies.reference import link_extents
+from trl_suite.bodies.state import POINT, REAL, allocated
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics import planar, spatial
-from trl_suite.kinematics.blocks import Block, Noise, columns
-from trl_suite.kinematics.planar import PlanarBodyData
-from trl_suite.kinematics.planar_figure import PlanarFigure
-from trl_suite.kinematics.planar_reference import link_extents
-from trl_suite.kinematics.spatial import SpatialBodyData
-from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.common.spatial_rules import HEIGHT_MAP, observe_body
-from trl_suite.tasks.imitation.planar import VIEW_AHEAD, VIEW_BEHIND
-from trl_suite.tasks.spatial_task import maps
+from trl_suite.tasks.common.control import HEIGHT_MAP, maps, planar_heights
 from trl_suite.tasks.task import (
     CONTROL_TIMESTEP,
-    MOST_SAMPLES,
     MOST_SUBSTEPS,
     SUBSTEPS,
     TERRAIN_LEVEL,
@@ -36,6 +30,7 @@ from trl_suite.tasks.task import (
     check_position_options,
 )
 from trl_suite.tasks.terms import Outcome, conclude
+from trl_suite.tasks.tracking import make_body
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, option
@@ -53,67 +48,35 @@ class WalkState(NamedTuple):
       distance: distance travelled along the target heading, (n,) m.
     """
 
-    origin: np.ndarray
-    target_heading: np.ndarray
-    distance: np.ndarray
+    origin: np.ndarray = POINT
+    target_heading: np.ndarray = REAL
+    distance: np.ndarray = REAL
 
 
-class PlanarWalkData(NamedTuple):
-    """Data for the compiled functions of a planar walk."""
+class WalkData(NamedTuple):
+    """Data for the compiled functions of a walk.
 
-    body: PlanarBodyData
-    state: WalkState
-    outcome: Outcome
+    Attributes:
+      measurement: of the bodies, which write their own blocks to the observation.
+      diverged: whether the physics has diverged in the last step, (n,).
+      columns: first columns of the observation blocks.
+    """
 
-
-class SpatialWalkData(NamedTuple):
-    """Data for the compiled functions of a spatial walk; `columns`: of the observation blocks."""
-
-    body: SpatialBodyData
+    measurement: Measurement
+    diverged: np.ndarray
     columns: Any
     state: WalkState
     outcome: Outcome
 
 
-# In the plane.
-
-
 @compiled
-def observe_planar(i: int, data: PlanarWalkData) -> None:
-    """Measures and observes."""
-    body = data.body
-    planar.look(i, body, data.outcome.observation)
-    data.state.distance[i] = body.physics.qpos[i, body.ids.qpos[0]] - data.state.origin[i, 0]
-
-
-@compiled
-def finish_planar(env_ids: np.ndarray, stepped: bool, data: PlanarWalkData) -> None:
-    """Finishes steps, or only observes."""
-    for i in env_ids:
-        body, outcome = data.body, data.outcome
-        if stepped:
-            outcome.diverged[i] = planar.breaks_down(i, body)
-            if outcome.diverged[i]:  # keeps the last finite observation
-                conclude(i, True, outcome)
-                continue
-        observe_planar(i, data)
-        if stepped:
-            conclude(i, planar.has_fallen(i, body.ids, body.physics), outcome)
-
-
-# In three dimensions.
-
-
-@compiled
-def observe_spatial(i: int, data: SpatialWalkData) -> None:
-    """Measures and observes."""
-    body, state, columns = data.body, data.state, data.columns
-    observation, measurement = data.outcome.observation, body.measurement
-    spatial.look(i, body)
-    observe_body(i, columns, body, observation)
-    bearing = state.target_heading[i] - measurement.heading[i]
-    observation[i, columns.target_heading] = math.cos(bearing)
-    observation[i, columns.target_heading + 1] = math.sin(bearing)
+def observe(i: int, data: WalkData) -> None:
+    """Writes the distance, and the block `TARGET_HEADING`."""
+    state, columns, measurement = data.state, data.columns, data.measurement
+    if columns.target_heading >= 0:
+        bearing = state.target_heading[i] - measurement.heading[i]
+        data.outcome.observation[i, columns.target_heading] = math.cos(bearing)
+        data.outcome.observation[i, columns.target_heading + 1] = math.sin(bearing)
     x, y = measurement.root[i, 0] - state.origin[i, 0], measurement.root[i, 1] - state.origin[i, 1]
     state.distance[i] = (
         math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
@@ -121,24 +84,25 @@ def observe_spatial(i: int, data: SpatialWalkData) -> None:
 
 
 TARGET_HEADING = Block(
-    'target_heading', 2, '1', 'cosine and sine of the bearing of the target heading, the heading at the start',
+    'target_heading',
+    2,
+    '1',
+    'cosine and sine of the bearing of the target heading, the heading at the start',
     Noise((0.005, 0.02, 0.05)),
-)  # fmt: skip
+)
 
 
 @compiled
-def finish_spatial(env_ids: np.ndarray, stepped: bool, data: SpatialWalkData) -> None:
-    """Finishes steps, or only observes."""
+def finish_all(env_ids: np.ndarray, stepped: bool, data: WalkData) -> None:
+    """Finishes steps, or only observes, after bodies were measured; takes a pack."""
     for i in env_ids:
-        body, outcome = data.body, data.outcome
+        outcome = data.outcome
         if stepped:
-            outcome.diverged[i] = spatial.breaks_down(i, body)
-            if outcome.diverged[i]:  # keeps the last finite observation
-                conclude(i, True, outcome)
+            outcome.diverged[i] = data.diverged[i]
+            conclude(i, data.diverged[i] or data.measurement.fallen[i], outcome)
+            if data.diverged[i]:  # keeps the last finite observation
                 continue
-        observe_spatial(i, data)
-        if stepped:
-            conclude(i, body.measurement.fallen[i], outcome)
+        observe(i, data)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -149,9 +113,12 @@ class WalkConfig(Config):
         SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
     )
     action_scale: float | None = option(
-        None, 'joint angle per unit action, from the working posture; by default 1.5',
-        unit='rad', above=0, actuation='position',
-    )  # fmt: skip
+        None,
+        'joint angle per unit action, from the working posture; by default 1.5',
+        unit='rad',
+        above=0,
+        actuation='position',
+    )
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
 
 
@@ -159,12 +126,7 @@ class WalkConfig(Config):
 class PlanarWalkConfig(WalkConfig):
     """Options of a planar walk."""
 
-    terrain_observation: int = option(
-        0,
-        'number of observed ground heights, from 0.5 m behind to 3 m ahead of the root; 0: none',
-        at_least=0,
-        at_most=MOST_SAMPLES,
-    )
+    terrain_observation: int = planar_heights()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -215,23 +177,15 @@ class Walk(Task):
             config = SpatialWalkConfig() if self._spatial else PlanarWalkConfig()
         self.character, self.arena, self.config = character, arena, config
         self.actuation_model = actuation_model
-        self.figure: Any
-        if isinstance(arena, SpatialArena):
-            assert isinstance(config, SpatialWalkConfig)
-            self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
-            self.fields = SpatialFigure.fields
-        else:
-            assert isinstance(config, PlanarWalkConfig)
-            self.figure = PlanarFigure(
-                character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation
-            )
+        self.figure: Any = make_body(character, arena, config.terrain_observation)
+        self.fields = self.figure.fields
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         check_position_options(actuation_model, 'clip', config.action_scale)
         scale = config.action_scale
+        options = {} if scale is None else {'action_scale': scale}
         self.action_map = actuation.add(
-            character, actuation_model, self.physics_timestep,
-            **({} if scale is None else {'action_scale': scale}),
-        )  # fmt: skip
+            character, actuation_model, self.physics_timestep, **options
+        )
         self.observed = *self.figure.blocks, TARGET_HEADING.observed_if(self._spatial)
 
     @property
@@ -240,24 +194,22 @@ class Walk(Task):
 
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
+        self.state = allocated(WalkState, n)
+        self._allocate(n, self.state.distance)
+        self.saved = (self.state, self.outcome)
         figure = self.figure
-        if self._spatial:
-            figure.bind(world, self.action_map)
-        else:
-            figure.bind(world, self.blocks, action_map=self.action_map)
+        figure.bind(world, self.action_map, self.outcome.observation, self.observed)
         self._pose, self._extents = self._posture(world)
         # Height of the root above the ground in the working posture, m.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
-        self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
-        self._allocate(n, self.state.distance)
-        self.saved = (self.state, self.outcome)
-        data: SpatialWalkData | PlanarWalkData
-        if self._spatial:
-            data = SpatialWalkData(figure.data, columns(self.observed), self.state, self.outcome)
-        else:
-            data = PlanarWalkData(figure.data, self.state, self.outcome)
-        self._finish = finish_spatial if self._spatial else finish_planar
+        data = WalkData(
+            measurement=figure.measurement,
+            diverged=figure.data.diverged,
+            columns=columns(self.observed),
+            state=self.state,
+            outcome=self.outcome,
+        )
         self._pack = packed(data)
 
     @property
@@ -288,18 +240,15 @@ class Walk(Task):
         spawns = np.zeros((count, 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             seed = self.terrain_seed(i, random_state)
+            level = self.config.terrain_level
             if isinstance(self.arena, SpatialArena):
-                ground = SpatialGround(terrain, seed, terrain_level=self.config.terrain_level)
+                ground = SpatialGround(terrain, seed, terrain_level=level)
                 spawns[k] = ground.spawn(random_state)
                 self.arena.begin_episode(i, ground, spawns[k, :2])
             else:
-                self.arena.begin_episode(
-                    i, PlanarGround(terrain, seed, terrain_level=self.config.terrain_level)
-                )
-        if self._spatial:
-            self.figure.place(env_ids, poses, rates, spawns)
-        else:
-            self.figure.place(env_ids, poses, rates, np.tile(self._extents, (count, 1, 1)))
+                self.arena.begin_episode(i, PlanarGround(terrain, seed, terrain_level=level))
+        where = spawns if self._spatial else np.tile(self._extents, (count, 1, 1))
+        self.figure.place(env_ids, poses, rates, where)
         self.state.origin[env_ids], self.target_heading[env_ids] = spawns[:, :2], spawns[:, 2]
         for array in self.outcome[1:]:  # all but the observation
             array[env_ids] = 0
@@ -309,11 +258,13 @@ class Walk(Task):
         self.figure.control(env_ids, action)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        self._finish(env_ids, True, self._pack)
+        self.figure.measure(env_ids, stepped=True)
+        finish_all(env_ids, True, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
-        self._finish(env_ids, False, self._pack)
+        self.figure.measure(env_ids)
+        finish_all(env_ids, False, self._pack)
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the components of horizontal vectors (n, 2) along the target heading, (n,)."""

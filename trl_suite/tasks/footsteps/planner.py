@@ -1,16 +1,17 @@
-"""Footstep plans in three dimensions: drawn at the start of an episode, and at each landing."""
+"""Footstep plans, drawn at the start of an episode, and at each landing."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from trl_suite.arenas import SpatialArena
-from trl_suite.kinematics.spatial import SpatialMeasurement
+from trl_suite.bodies.body import Body, Measurement
 from trl_suite.motion import quaternion
 from trl_suite.tasks.common.footstep_plan import SIDE, FootstepPlan
 from trl_suite.tasks.common.plans import ROOT_TURN_LIMIT, Plans
-from trl_suite.tasks.common.spatial_rules import Clock
-from trl_suite.tasks.footsteps.spatial_rules import FootstepState
+from trl_suite.tasks.common.tracking_rules import Clock
+from trl_suite.tasks.footsteps.rules import FootstepState
 
 NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading
 GOAL_REACHED = 1.0  # m; a nearer goal is redrawn
@@ -26,7 +27,7 @@ class Planner:
     def __init__(
         self,
         plans: Plans,
-        arena: SpatialArena,
+        figure: Body,
         plan: FootstepPlan,
         state: FootstepState,
         clock: Clock,
@@ -39,7 +40,7 @@ class Planner:
 
         Args:
           plans: how plans are drawn.
-          arena: the arena, for heights of landing places, and for goals.
+          figure: the body, for heights of landing places, and its arena, which draws goals.
           plan: the plan of each simulation, written here.
           state: the state of the task, written here.
           clock: the clocks.
@@ -47,13 +48,13 @@ class Planner:
           goals: whether plans lead to goals.
           grace_steps: control steps after a sharp turn in which landing errors do not count.
         """
-        self._plans, self._arena, self._clock, self._random = plans, arena, clock, random
+        self._plans, self._figure, self._clock, self._random = plans, figure, clock, random
+        self._arena: Any = figure.arena
+        self._sideways = figure.character.spec.spatial  # whether steps have a width
         self._plan, self._state = plan, state
         self._goals, self._grace_steps = goals, grace_steps
 
-    def begin(
-        self, env_ids: np.ndarray, origins: np.ndarray, measurement: SpatialMeasurement
-    ) -> None:
+    def begin(self, env_ids: np.ndarray, origins: np.ndarray, measurement: Measurement) -> None:
         """Draws the first plans of episodes, and their first goals.
 
         Args:
@@ -83,7 +84,7 @@ class Planner:
         for which, foot in enumerate((1 - stance, stance)):
             anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
 
-    def replan(self, env_ids: np.ndarray, measurement: SpatialMeasurement) -> None:
+    def replan(self, env_ids: np.ndarray, measurement: Measurement) -> None:
         """Draws the next plans of some simulations at a switch of stance.
 
         Args:
@@ -133,7 +134,8 @@ class Planner:
         plans, random = self._plans, self._random[i]
         if always or random.uniform() < plans.change:
             self._state.length[i] = random.uniform(*plans.length)
-            self._state.width[i] = random.uniform(*plans.width)
+            if self._sideways:
+                self._state.width[i] = random.uniform(*plans.width)
 
     def _next_size(self, i: int) -> tuple[float, float]:
         """Returns length and width of the next step, m; redraws them with probability `change`."""
@@ -171,6 +173,5 @@ class Planner:
         steps[:, 1] *= SIDE[feet]
         places = places + quaternion.rotate_xy(steps, self._plan.heading[env_ids])
         self._plan.landing[env_ids, which, :2] = places
-        heights = self._arena.height(places[:, :1], places[:, 1:], env_ids)
-        self._plan.landing[env_ids, which, 2] = heights[:, 0]
+        self._plan.landing[env_ids, which, 2] = self._figure.heights(env_ids, places)
         return places

@@ -1,4 +1,4 @@
-"""Tracking planned footsteps in three dimensions: compiled functions."""
+"""Tracking planned footsteps: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -7,39 +7,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.spatial import SpatialBodyData, breaks_down, polar
-from trl_suite.kinematics.spatial_reference import feature, moment
-from trl_suite.tasks.common.comparison import (
-    Comparison,
-    com_error,
-    motion_errors,
-)
-from trl_suite.tasks.common.footstep_plan import (
-    FootstepPlan,
-    observe_plan,
-    update_stance,
-)
-from trl_suite.tasks.common.rewards import HEADING_WEIGHT, STEP_TERMS
-from trl_suite.tasks.common.spatial_rules import (
-    Clock,
-    Travel,
-    View,
-    look_and_travel,
-    observe_body,
+from trl_suite.bodies.reference import feature, moment
+from trl_suite.bodies.state import FLAG, PLACE, POINT, REAL, WHOLE
+from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
+from trl_suite.tasks.common.rewards import HEADING_WEIGHT, STEP_TERMS, com_error, motion_errors
+from trl_suite.tasks.common.tracking_rules import (
+    TrackingData,
+    go,
     observe_phase,
+    observe_place,
+    proceed,
     publish,
-    tick,
 )
-from trl_suite.tasks.terms import Outcome, Term, conclude, facing, give, score, wrapped
+from trl_suite.tasks.terms import Term, conclude, facing, give, score, wrapped
 from trl_suite.util.compiled import compiled
 
-TERMS = (
-    *STEP_TERMS,
-    Term(
-        'heading', HEADING_WEIGHT,
-        '((1 + cos error) / 2)^4, error: angle between heading and planned heading',
-    ),
-)  # fmt: skip
+HEADING = Term(
+    'heading',
+    HEADING_WEIGHT,
+    '((1 + cos error) / 2)^4, error: angle between heading and planned heading',
+)
+PLANAR_HEADING = Term(
+    'heading',
+    HEADING_WEIGHT,
+    '1 while the trunk points forwards, 0 while it points backwards',
+)
+TERMS, PLANAR_TERMS = (*STEP_TERMS, HEADING), (*STEP_TERMS, PLANAR_HEADING)
 
 
 class FootstepState(NamedTuple):
@@ -47,7 +40,7 @@ class FootstepState(NamedTuple):
 
     Attributes:
       length, width: length and width of the current steps, m.
-      track: track of the reference, see `SpatialReference`.
+      track: track of the reference, see `Reference`.
       turned: rotation of the reference about z, rad.
       shift: position of the origin of its track, (n, 2) m.
       goal: position of the goal, (n, 3) m.
@@ -57,56 +50,51 @@ class FootstepState(NamedTuple):
       missed: whether the landing error was too large in the last step.
     """
 
-    length: np.ndarray
-    width: np.ndarray
-    track: np.ndarray
-    turned: np.ndarray
-    shift: np.ndarray
-    goal: np.ndarray
-    push: np.ndarray
-    push_end: np.ndarray
-    push_begin: np.ndarray
-    excused: np.ndarray
-    missed: np.ndarray
+    length: np.ndarray = REAL
+    width: np.ndarray = REAL
+    track: np.ndarray = WHOLE
+    turned: np.ndarray = REAL
+    shift: np.ndarray = POINT
+    goal: np.ndarray = PLACE
+    push: np.ndarray = PLACE
+    push_end: np.ndarray = WHOLE
+    push_begin: np.ndarray = WHOLE
+    excused: np.ndarray = WHOLE
+    missed: np.ndarray = FLAG
 
 
 class FootstepData(NamedTuple):
     """Data for the compiled functions of footsteps.
 
     Attributes:
-      period: that of two steps, s.
+      tracking: data of every tracking task; the period is that of two steps.
+      turns: whether the character turns; a planar one can only point backwards.
       footstep_scales, heading_scale: factors of errors in the reward.
       largest_miss: landing error above which the episode fails, m.
     """
 
-    body: SpatialBodyData
-    outcome: Outcome
-    given: View
-    clock: Clock
-    travel: Travel
-    period: float
-    comparison: Comparison
+    tracking: TrackingData
     plan: FootstepPlan
     state: FootstepState
+    turns: bool
     footstep_scales: np.ndarray
     heading_scale: float
     largest_miss: float
 
 
-# A step of simulation i: `land`, the next plan if stance switches, `finish`.
+# A step of simulation i, after the body was measured: `land`, the next plan if stance switches,
+# `finish`.
 
 
 @compiled
 def land(i: int, data: FootstepData) -> bool:
-    """Advances the clock, measures, and detects landings; returns whether a new plan is needed."""
-    plan, state, clock = data.plan, data.state, data.clock
-    tick(i, data.period, clock)
+    """Advances the clock and detects landings; returns whether a new plan is needed."""
+    plan, state, tracking = data.plan, data.state, data.tracking
     plan.landed[i] = state.missed[i] = False
-    data.outcome.diverged[i] = breaks_down(i, data.body)
-    if data.outcome.diverged[i]:
+    if not proceed(i, tracking):
         return False
-    look_and_travel(i, data.body, data.travel)
-    plan.landed[i] = update_stance(i, clock.phase[i], data.body.measurement, plan)
+    clock = tracking.clock
+    plan.landed[i] = update_stance(i, clock.phase[i], tracking.measurement, plan)
     if plan.landed[i] and plan.landing_error[i] > data.largest_miss:
         state.missed[i] = clock.steps[i] > state.excused[i]
     return plan.landed[i]
@@ -115,12 +103,12 @@ def land(i: int, data: FootstepData) -> bool:
 @compiled
 def finish(i: int, data: FootstepData) -> None:
     """Computes reward, failure and observation."""
-    outcome = data.outcome
+    outcome = data.tracking.outcome
     if outcome.diverged[i]:  # keeps the last finite observation
         conclude(i, True, outcome)
         return
     compare(i, data)
-    conclude(i, data.body.measurement.fallen[i] or data.state.missed[i], outcome)
+    conclude(i, data.tracking.measurement.fallen[i] or data.state.missed[i], outcome)
     observe(i, data)
 
 
@@ -133,9 +121,9 @@ def step_phase(phase: float) -> float:
 @compiled
 def compare(i: int, data: FootstepData) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
-    plan, state, comparison = data.plan, data.state, data.comparison
-    measurement, tracks = data.body.measurement, comparison.tracks
-    share = step_phase(data.clock.phase[i])
+    plan, state, comparison = data.plan, data.state, data.tracking.comparison
+    measurement, tracks = data.tracking.measurement, comparison.tracks
+    share = step_phase(data.tracking.clock.phase[i])
     row, fraction = moment(share, state.track[i], tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     # The reference was aligned with the heading of the character at the switch of stance.
@@ -157,7 +145,7 @@ def compare(i: int, data: FootstepData) -> None:
             if k == 2:
                 off += feature(row, fraction, column, tracks)
             step += off * off
-    terms, outcome = comparison.terms, data.outcome
+    terms, outcome = comparison.terms, data.tracking.outcome
     score(i, pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, com, terms.com, outcome)
@@ -168,22 +156,23 @@ def compare(i: int, data: FootstepData) -> None:
         end += outcome.reward_terms[i, terms.end_effector.column]
     outcome.reward_terms[i, terms.end_effector.column] = end / len(data.footstep_scales)
     off = abs(wrapped(plan.heading[i] - measurement.heading[i]))
+    if not data.turns and measurement.cosine[i] < 0.0:
+        off = math.pi
     give(i, facing(min(data.heading_scale * off, math.pi)), terms.heading, outcome)
 
 
 @compiled
 def observe(i: int, data: FootstepData) -> None:
-    """Writes the observation."""
-    body, columns, full = data.body, data.given.columns, data.given.full
-    measurement = body.measurement
-    observe_body(i, columns, body, full)
-    observe_phase(i, columns, data.clock, full)
+    """Writes the blocks after those of the body: phase, contact and plan, and the goal."""
+    tracking = data.tracking
+    columns, full, measurement = tracking.given.columns, tracking.given.full, tracking.measurement
+    observe_phase(i, columns, tracking.clock, full)
     observe_plan(i, columns, measurement, data.plan, full)
     if columns.goal >= 0:
         x = data.state.goal[i, 0] - measurement.root[i, 0]
         y = data.state.goal[i, 1] - measurement.root[i, 1]
-        full[i, columns.goal], full[i, columns.goal + 1] = polar(i, x, y, measurement)
-    publish(i, data.given, data.outcome)
+        observe_place(i, columns.goal, x, y, measurement, full)
+    publish(i, tracking.given, tracking.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -207,8 +196,8 @@ def finish_all(env_ids: np.ndarray, data: FootstepData) -> None:
 
 @compiled
 def observe_all(env_ids: np.ndarray, data: FootstepData) -> None:
-    """Measures, writes reward terms for the current state, and observes."""
+    """Writes distances, reward terms of the current state, and observations."""
     for i in env_ids:
-        look_and_travel(i, data.body, data.travel)
+        go(i, data.tracking.along, data.tracking.measurement, data.tracking.travel)
         compare(i, data)
         observe(i, data)

@@ -1,4 +1,4 @@
-"""Compiled functions that all tasks of a 3D walker share: clock, actions, ground, observation."""
+"""What tasks that track a reference motion share: clock, distance, mirrored view, observation."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.blocks import CLOCK, Block, Reflection
-from trl_suite.kinematics.spatial import SpatialBodyData, look
+from trl_suite.bodies.blocks import CLOCK, Block, Reflection
+from trl_suite.bodies.body import Measurement, polar
+from trl_suite.bodies.state import PLACE, REAL, WHOLE
+from trl_suite.tasks.common.rewards import Comparison
 from trl_suite.tasks.task import CONTROL_TIMESTEP, PHASE_BINS
 from trl_suite.tasks.terms import Outcome
-from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_inline
 
-TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
-HEIGHT_MAP = "observed map of the terrain: 'height', or () for none"
-ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
-_DIGITS = 1e9  # the clock is rounded to 1 / _DIGITS of a cycle
+DIGITS = 1e9  # the clock is rounded to 1 / DIGITS of a cycle
 
 
 class Clock(NamedTuple):
@@ -30,10 +27,10 @@ class Clock(NamedTuple):
       phase: phase in [0, 1).
     """
 
-    start: np.ndarray
-    steps: np.ndarray
-    cycles: np.ndarray
-    phase: np.ndarray
+    start: np.ndarray = REAL
+    steps: np.ndarray = WHOLE
+    cycles: np.ndarray = REAL
+    phase: np.ndarray = REAL
 
 
 class Travel(NamedTuple):
@@ -41,11 +38,11 @@ class Travel(NamedTuple):
 
     Attributes:
       origin: x, y (m) and heading (rad) at the start, (n, 3).
-      distance: horizontal distance of the root from the start, (n,) m; in imitation along +x.
+      distance: distance of the root from the start, (n,) m.
     """
 
-    origin: np.ndarray
-    distance: np.ndarray
+    origin: np.ndarray = PLACE
+    distance: np.ndarray = REAL
 
 
 class View(NamedTuple):
@@ -74,7 +71,39 @@ class View(NamedTuple):
     action: np.ndarray
 
 
+class TrackingData(NamedTuple):
+    """Data for the compiled functions of tasks that track a reference motion.
+
+    Attributes:
+      measurement: of the bodies, which write their own blocks to `given.full`.
+      diverged: whether the physics has diverged in the last step, (n,).
+      period: that of the motion, s.
+      along: whether the distance travelled is along +x, not in any horizontal direction.
+    """
+
+    measurement: Measurement
+    diverged: np.ndarray
+    outcome: Outcome
+    given: View
+    clock: Clock
+    travel: Travel
+    period: float
+    along: bool
+    comparison: Comparison
+
+
 # Parts of a step of simulation i.
+
+
+@compiled
+def proceed(i: int, data: TrackingData) -> bool:
+    """Advances clock and distance; returns False if the physics has diverged."""
+    tick(i, data.period, data.clock)
+    data.outcome.diverged[i] = data.diverged[i]
+    if data.diverged[i]:
+        return False
+    go(i, data.along, data.measurement, data.travel)
+    return True
 
 
 @compiled
@@ -83,31 +112,16 @@ def tick(i: int, period: float, clock: Clock) -> None:
     clock.steps[i] += 1
     cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / period)
     # Rounded, so that rounding errors of the sum do not delay the switch of stance at half a cycle.
-    clock.cycles[i] = np.rint(cycles * _DIGITS) / _DIGITS
+    clock.cycles[i] = np.rint(cycles * DIGITS) / DIGITS
     clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
 
 
 @compiled
-def look_and_travel(i: int, body: SpatialBodyData, travel: Travel) -> None:
-    """Measures the body and its distance from the start."""
-    look(i, body)
-    x = body.measurement.root[i, 0] - travel.origin[i, 0]
-    y = body.measurement.root[i, 1] - travel.origin[i, 1]
-    travel.distance[i] = np.sqrt(x * x + y * y)
-
-
-@compiled
-def observe_body(i: int, columns: Any, body: SpatialBodyData, observation: np.ndarray) -> None:
-    """Writes the blocks terrain, pose and velocity; see `spatial_figure.body_blocks`."""
-    measurement = body.measurement
-    if columns.terrain >= 0:
-        block = observation[i, columns.terrain : columns.terrain + SAMPLES * SAMPLES]
-        x, y = measurement.root[i, 0], measurement.root[i, 1]
-        spatial_ground.height_map(i, x, y, measurement.heading[i], body.ground, block)
-    for k in range(measurement.pose.shape[1]):
-        observation[i, columns.pose + k] = measurement.pose[i, k]
-    for k in range(measurement.velocity.shape[1]):
-        observation[i, columns.velocity + k] = measurement.velocity[i, k]
+def go(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
+    """Writes the distance of the root from the start, along +x or in any horizontal direction."""
+    x = measurement.root[i, 0] - travel.origin[i, 0]
+    y = measurement.root[i, 1] - travel.origin[i, 1]
+    travel.distance[i] = x if along else np.sqrt(x * x + y * y)
 
 
 @compiled
@@ -129,6 +143,15 @@ PHASE = Block(
     kept=tuple(range(1 + PHASE_BINS // 2)),
     kept_meaning='phase of the step in [0, 1); then the one-hot of its half',
 )  # fmt: skip
+
+
+@compiled
+def observe_place(
+    i: int, column: int, x: float, y: float, measurement: Measurement, observation: np.ndarray
+) -> None:
+    """Writes bearing and distance of a place x, y m from the root, in world axes."""
+    bearing, distance = polar(i, x, y, measurement)
+    observation[i, column], observation[i, column + 1] = bearing, distance
 
 
 @compiled_inline

@@ -111,11 +111,17 @@ def layout(blocks: Iterable[Block]) -> dict[str, slice]:
     return found
 
 
-def columns(blocks: Iterable[Block]) -> Any:
-    """Returns the first column of each block for compiled functions; -1: it is empty."""
+def columns(blocks: Iterable[Block], of: Iterable[Block] | None = None) -> Any:
+    """Returns the first column of each block for compiled functions; -1: it is empty.
+
+    Args:
+      blocks: consecutive blocks.
+      of: the blocks that are asked for; by default all of them.
+    """
     blocks = tuple(blocks)
     starts = {name: part.start for name, part in layout(blocks).items()}
-    return by_name('Columns', {block.name: starts.get(block.name, -1) for block in blocks})
+    names = [block.name for block in (blocks if of is None else of)]
+    return by_name('Columns', {name: starts.get(name, -1) for name in names})
 
 
 def by_name(kind: str, values: Mapping[str, Any]) -> Any:

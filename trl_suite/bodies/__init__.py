@@ -1,0 +1,1 @@
+"""Characters bound to their simulations: measurement, observation, placement, reference motion."""

@@ -1,0 +1,231 @@
+"""What tasks measure of a body, planar or spatial, and its observation blocks and controls.
+
+The heading frame of a body has its origin on the ground under the root, x along the root's heading, y to
+the left and z up. A planar body is measured as a spatial one in the plane y = 0 with heading 0; while its
+trunk points backwards, only `cosine` is -1, so that x of its heading frame points backwards, too. Rules
+that are written for measurements are for both.
+"""
+
+from __future__ import annotations
+
+import abc
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.bodies.blocks import Block, columns
+from trl_suite.bodies.state import FLAG, PLACE, REAL, allocated
+from trl_suite.characters import Character
+from trl_suite.engine import World, native
+from trl_suite.util.compiled import Compiled, compiled, compiled_inline, packed
+
+MAX_JOINT_SPEED = 200.0  # rad/s; above it a simulation counts as diverged
+CLEARANCE = 0.001  # m; between links and ground after the initial placement
+
+
+class Measurement(NamedTuple):
+    """What is measured of n bodies.
+
+    Attributes:
+      root, com: positions of the root and of the centre of mass, (n, 3) m.
+      heading: heading of the root, rad to the left of +x, (n,).
+      cosine, sine: cosine and sine of the heading, (n,).
+      under: height of the ground under the root, (n,) m.
+      feet: world positions of the end effectors' joints, (n, E, 3) m.
+      com_velocity: velocity of the centre of mass, world axes, (n, 3) m/s.
+      contact: 1 where an end effector touches the ground, (n, E).
+      fallen: whether a fall link touches the ground, (n,).
+      pose, velocity: the observation blocks of these names.
+      features: features to compare with a reference, (n, F); see `feature_columns`.
+    """
+
+    feet: np.ndarray
+    contact: np.ndarray
+    pose: np.ndarray
+    velocity: np.ndarray
+    features: np.ndarray
+    root: np.ndarray = PLACE
+    com: np.ndarray = PLACE
+    heading: np.ndarray = REAL
+    cosine: np.ndarray = REAL
+    sine: np.ndarray = REAL
+    under: np.ndarray = REAL
+    com_velocity: np.ndarray = PLACE
+    fallen: np.ndarray = FLAG
+
+
+def feature_columns(rotations: int, angles: int, rates: int, effectors: int) -> dict[str, slice]:
+    """Returns name -> columns of the features of a body, from the number of numbers of each.
+
+    `rotations`: quaternions of the root without its heading and of the ball joints; `angles`: of
+    the hinges, and of a planar root first, rad; `rates`: of the root in the heading frame and of all
+    joints, rad/s; `effectors`: end effector positions in the heading frame (in the plane in world
+    axes), x and y from the centre of mass or the root, z above the ground, m; `com_velocity`: in world
+    axes, m/s; `height`: of the root above the ground, m.
+    """
+    sizes = {
+        'rotations': rotations,
+        'angles': angles,
+        'rates': rates,
+        'effectors': 3 * effectors,
+        'com_velocity': 3,
+        'height': 1,
+    }
+    return slices(sizes)
+
+
+def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Returns the slices of consecutive parts with these sizes, by name."""
+    stops = itertools.accumulate(sizes.values())
+    return {
+        name: slice(stop - size, stop)
+        for (name, size), stop in zip(sizes.items(), stops, strict=True)
+    }
+
+
+@compiled_inline
+def ahead_and_left(i: int, x: float, y: float, measurement: Measurement) -> tuple[float, float]:
+    """Converts a horizontal vector from world axes to the heading frame."""
+    cosine, sine = measurement.cosine[i], measurement.sine[i]
+    return cosine * x + sine * y, cosine * y - sine * x
+
+
+@compiled_inline
+def polar(i: int, x: float, y: float, measurement: Measurement) -> tuple[float, float]:
+    """Returns bearing (rad to the left) and length of a horizontal vector in world axes."""
+    ahead, left = ahead_and_left(i, x, y, measurement)
+    return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
+
+
+@compiled
+def is_broken(i: int, limit: float, body: Any) -> bool:
+    """Returns whether a simulation has diverged, or a body turns faster than a limit, rad/s."""
+    return native.diverged(i, body.engine) or native.too_fast(
+        i, body.ids.turning, limit, body.physics.qvel
+    )
+
+
+class Body(abc.ABC):
+    """One body in every simulation of a world.
+
+    Attributes:
+      character, arena: the character, attached to the arena.
+      blocks: its observation blocks: terrain, pose, velocity, and strain of muscles.
+      columns: columns of the features in `Measurement`, after `bind`.
+      ids: its ids in the compiled model.
+      data: ids, physics, ground and measurement, for compiled functions.
+      measurement: the last measurement.
+      pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
+      links, effectors: body ids, in link order.
+      geoms: ids of the collision geoms.
+    """
+
+    fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
+    control_all: Compiled
+    measure_all: Compiled
+    character: Character
+    arena: Any
+    blocks: tuple[Block, ...]
+    columns: dict[str, slice]
+    data: Any
+    pose_qpos: np.ndarray
+    pose_dof: np.ndarray
+    _world: World
+
+    def _bind(self, world: World) -> None:
+        """Resolves ids that every body has."""
+        self._world = world
+        self.arena.bind(world)
+        character = self.character
+        self.links = world.body_ids([body.full_identifier for body in character.bodies])
+        self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
+        self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
+        mass = world.models[0].body_mass[self.links]
+        self._share = mass / mass.sum()
+
+    def _use(
+        self,
+        kind: Any,
+        ids: Any,
+        physics: Any,
+        ground: Any,
+        action_map: ActionMap,
+        observation: np.ndarray,
+        observed: tuple[Block, ...],
+    ) -> None:
+        """Makes the data, and its pack.
+
+        Args:
+          kind: type of the data.
+          ids: ids of the body.
+          physics: type of the fields of the physics.
+          ground: the ground of all simulations, for compiled functions.
+          action_map, observation, observed: see `PlanarBody.bind`.
+        """
+        world, scope = self._world, f'{self.character.mjcf_model.model}/'
+        first = world.control_addresses([scope + action_map.actuators[0]])[0]  # of consecutive ones
+        self.ids = ids
+        sizes = {block.name: block.size for block in self.blocks}
+        self.measurement = allocated(
+            Measurement,
+            world.n,
+            feet=np.zeros((len(self.effectors), 3)),
+            contact=np.zeros(len(self.effectors)),
+            pose=np.zeros(sizes['pose']),
+            velocity=np.zeros(sizes['velocity']),
+            features=np.zeros(self.columns['height'].stop),
+        )
+        self.data = kind(
+            engine=world.engine,
+            ids=ids,
+            physics=physics(*(getattr(world, name) for name in physics._fields)),
+            ground=ground,
+            drive=action_map.drive(int(first)),
+            ctrl=world.ctrl,
+            measurement=self.measurement,
+            columns=columns(observed, self.blocks),
+            observation=observation,
+            leaving=np.zeros(world.n, bool),
+            diverged=np.zeros(world.n, bool),
+        )
+        self.pack = packed(self.data)
+
+    def control(self, env_ids: np.ndarray, action: np.ndarray) -> None:
+        """Writes the controls of some simulations; moves ground windows, so that images show them.
+
+        Args:
+          env_ids: indices of simulations.
+          action: actions of all simulations, (n, k), in [-1, 1].
+        """
+        if self.control_all(env_ids, action, self.pack):
+            self.recentre(env_ids[self.data.leaving[env_ids]])
+
+    @abc.abstractmethod
+    def recentre(self, env_ids: np.ndarray) -> None:
+        """Moves the ground windows of some simulations to the positions of their bodies."""
+
+    @abc.abstractmethod
+    def heights(self, env_ids: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Returns the heights of the ground of some simulations (m,) at places (m, 2), m."""
+
+    @abc.abstractmethod
+    def level_ground(self, n: int) -> Any:
+        """Returns level ground of height 0 for n bodies, for compiled functions."""
+
+    def measure(self, env_ids: np.ndarray | None = None, stepped: bool = False) -> Measurement:
+        """Measures the bodies of some simulations, or of all, and writes their observation blocks.
+
+        Args:
+          env_ids: indices of simulations.
+          stepped: whether the physics was advanced: `data.diverged` is then written, and bodies
+            whose physics has diverged, or that have left their ground, keep the last measurement.
+
+        Returns:
+          The measurement of all simulations.
+        """
+        self.measure_all(self._world.all_ids if env_ids is None else env_ids, stepped, self.pack)
+        return self.measurement

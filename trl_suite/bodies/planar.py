@@ -1,0 +1,365 @@
+"""A body in the plane: its ids, measurement, observation and placement on planar ground."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.actuation import hill
+from trl_suite.actuation.action_map import ActionMap, Drive, drive
+from trl_suite.actuation.muscles import Muscle
+from trl_suite.arenas import PlanarArena
+from trl_suite.bodies.blocks import HEIGHTS, PLACES, SPEEDS, Block, Noise
+from trl_suite.bodies.body import (
+    CLEARANCE,
+    MAX_JOINT_SPEED,
+    Body,
+    Measurement,
+    feature_columns,
+    is_broken,
+)
+from trl_suite.characters import Character
+from trl_suite.engine import World, native
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.util.compiled import compiled
+
+_UPRIGHT = np.pi / 2  # rad; below this pitch a trunk points forwards
+
+
+class PlanarIds(NamedTuple):
+    """A body's ids in a compiled model; links and joints in link order.
+
+    Attributes:
+      qpos, dof: addresses of x, z, pitch and the joints, (3 + J,).
+      turning: addresses of the rates of pitch and joints, (1 + J,).
+      links: body ids, the root body first, (L,).
+      effectors: body ids of the end effectors, (E,).
+      share: mass of each link over the total mass, (L,).
+      about_com: whether end effector positions are relative to the centre of mass, not to the root.
+      samples: x of observed ground heights, relative to the root, (S,) m.
+      fall: addresses of the contact sensors of fall links.
+      contact: those of end effectors; empty if they have none.
+      rest, scale: length of each observed muscle's tendon at zero strain, and its change per unit of
+        strain, m.
+    """
+
+    qpos: np.ndarray
+    dof: np.ndarray
+    turning: np.ndarray
+    links: np.ndarray
+    effectors: np.ndarray
+    share: np.ndarray
+    about_com: bool
+    samples: np.ndarray
+    fall: np.ndarray
+    contact: np.ndarray
+    rest: np.ndarray
+    scale: np.ndarray
+
+
+class PlanarState(NamedTuple):
+    """Fields of the physics that planar bodies are measured from, each (n, ...); see `World`."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    xpos: np.ndarray
+    xipos: np.ndarray
+    cvel: np.ndarray
+    subtree_com: np.ndarray
+    sensordata: np.ndarray
+    ten_length: np.ndarray
+
+
+class PlanarBodyData(NamedTuple):
+    """A body in all simulations, for compiled functions.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      columns: first columns of its blocks in the observation; -1: not observed.
+      observation: to which its blocks are written, (n, ...).
+      leaving: whether the body has left its ground window, which must then be moved, (n,).
+      diverged: whether the physics has diverged, or the body has left its ground, (n,).
+    """
+
+    engine: native.Engine
+    ids: PlanarIds
+    physics: PlanarState
+    ground: PlanarWindows
+    drive: Drive
+    ctrl: np.ndarray
+    measurement: Measurement
+    columns: Any
+    observation: np.ndarray
+    leaving: np.ndarray
+    diverged: np.ndarray
+
+
+@compiled
+def measure(i: int, body: PlanarBodyData) -> None:
+    """Measures a body; x of positions in `pose` and `velocity` is ahead of the trunk."""
+    ids, state, ground, out = body.ids, body.physics, body.ground, body.measurement
+    pitch = state.qpos[i, ids.qpos[2]]
+    facing = -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
+    x, z = state.qpos[i, ids.qpos[0]], state.qpos[i, ids.qpos[1]]
+    root = ids.links[0]
+    com_x, com_z = state.subtree_com[i, root, 0], state.subtree_com[i, root, 2]
+    under = planar_ground.height(i, x, ground)
+    out.cosine[i] = facing
+    out.root[i, 0], out.root[i, 2], out.com[i, 0], out.com[i, 2] = x, z, com_x, com_z
+    out.under[i], out.pose[i, 0] = under, z - under
+
+    speed_x = speed_z = 0.0
+    for k in range(len(ids.links)):
+        link = ids.links[k]
+        link_x, link_z = state.xipos[i, link, 0], state.xipos[i, link, 2]
+        # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
+        spin = state.cvel[i, link, 1]
+        v_x = state.cvel[i, link, 3] + (link_z - com_z) * spin
+        v_z = state.cvel[i, link, 5] - (link_x - com_x) * spin
+        speed_x += v_x * ids.share[k]
+        speed_z += v_z * ids.share[k]
+        out.pose[i, 1 + 2 * k], out.pose[i, 2 + 2 * k] = (link_x - x) * facing, link_z - z
+        out.velocity[i, 2 * k], out.velocity[i, 2 * k + 1] = v_x * facing, v_z
+    out.com_velocity[i, 0], out.com_velocity[i, 2] = speed_x, speed_z
+
+    count = len(ids.turning)
+    for k in range(count):
+        out.features[i, k] = state.qpos[i, ids.qpos[2 + k]]
+        out.features[i, count + k] = state.qvel[i, ids.turning[k]]
+    column, about = 2 * count, com_x if ids.about_com else state.xpos[i, root, 0]
+    for k in range(len(ids.effectors)):
+        foot_x = state.xpos[i, ids.effectors[k], 0]
+        foot_z = state.xpos[i, ids.effectors[k], 2]
+        out.feet[i, k, 0], out.feet[i, k, 2] = foot_x, foot_z
+        out.features[i, column] = foot_x - about
+        out.features[i, column + 2] = foot_z - planar_ground.height(i, foot_x, ground)
+        column += 3
+    out.features[i, column], out.features[i, column + 2] = speed_x, speed_z
+    out.features[i, column + 3] = z - under
+    for k in range(len(ids.contact)):
+        out.contact[i, k] = 1.0 if state.sensordata[i, ids.contact[k]] > 0.0 else 0.0
+    out.fallen[i] = False
+    for sensor in ids.fall:
+        if state.sensordata[i, sensor] != 0.0:
+            out.fallen[i] = True
+
+
+@compiled
+def observe_body(i: int, columns: Any, body: PlanarBodyData, observation: np.ndarray) -> None:
+    """Writes the blocks of a body, as `PlanarBody.blocks` describes them."""
+    ids, out = body.ids, body.measurement
+    x, facing = out.root[i, 0], out.cosine[i]
+    if columns.terrain >= 0:
+        for k in range(len(ids.samples)):
+            level = planar_ground.height(i, x + ids.samples[k] * facing, body.ground)
+            observation[i, columns.terrain + k] = level - out.under[i]
+    if columns.pose >= 0:
+        for k in range(out.pose.shape[1]):
+            observation[i, columns.pose + k] = out.pose[i, k]
+        for k in range(out.velocity.shape[1]):
+            observation[i, columns.velocity + k] = out.velocity[i, k]
+    if columns.strain >= 0:
+        for k in range(len(ids.rest)):
+            stretched = body.physics.ten_length[i, k] - ids.rest[k]
+            observation[i, columns.strain + k] = stretched / ids.scale[k]
+
+
+@compiled
+def breaks_down(i: int, limit: float, body: PlanarBodyData) -> bool:
+    """Returns whether a simulation diverged (see `is_broken`) or a body left its ground."""
+    x = body.physics.qpos[i, body.ids.qpos[0]]
+    return is_broken(i, limit, body) or planar_ground.is_lost(i, x, body.ground)
+
+
+@compiled
+def has_left(i: int, body: PlanarBodyData) -> bool:
+    """Returns whether a body has left its ground window, which must be moved."""
+    return planar_ground.has_left(i, body.physics.qpos[i, body.ids.qpos[0]], body.ground)
+
+
+@compiled
+def measure_all(env_ids: np.ndarray, stepped: bool, body: PlanarBodyData) -> None:
+    """Measures and observes bodies; see `Body.measure`. Takes a pack."""
+    for i in env_ids:
+        if stepped:
+            body.diverged[i] = breaks_down(i, MAX_JOINT_SPEED, body)
+            if body.diverged[i]:
+                continue
+        measure(i, body)
+        observe_body(i, body.columns, body, body.observation)
+
+
+@compiled
+def control_all(env_ids: np.ndarray, action: np.ndarray, body: PlanarBodyData) -> int:
+    """Writes controls; returns how many ground windows must be moved. Takes a pack."""
+    leaving = 0
+    for i in env_ids:
+        drive(i, action, body.drive, body.ctrl)
+        body.leaving[i] = has_left(i, body)
+        leaving += body.leaving[i]
+    return leaving
+
+
+class PlanarBody(Body):
+    """A planar character in every simulation of a world; see `Body`."""
+
+    control_all, measure_all = control_all, measure_all
+    arena: PlanarArena
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena,
+        behind: float,
+        ahead: float,
+        samples: int,
+        contact: bool = False,
+        muscles: tuple[Muscle, ...] = (),
+    ) -> None:
+        """Attaches the character and adds a contact sensor for each of its fall links.
+
+        Args:
+          character: a planar character; it is attached to the arena and given root joints.
+          arena: the arena with its terrain.
+          behind: distance behind the root at which the observed ground heights begin, m.
+          ahead: distance ahead of the root at which they end, m.
+          samples: number of observed ground heights; 0 for none.
+          contact: whether to add contact sensors for end effectors too.
+          muscles: the muscles whose strain is observed.
+        """
+        self.character, self.arena, self._muscles = character, arena, muscles
+        character.create_root_joints(arena.attach(character))
+        self._samples = np.linspace(-behind, ahead, samples)
+        self._fall_sensors = [self._add_sensor(n, 'fall') for n in character.spec.fall_links]
+        ends = character.spec.end_effectors if contact else ()
+        self._contact_sensors = [self._add_sensor(name, 'contact') for name in ends]
+        links = len(character.spec.links)
+        self.blocks = (
+            Block(
+                'terrain', samples, 'm',
+                f'ground heights from {behind:g} m behind to {ahead:g} m ahead, relative to the ground under '
+                'the root', HEIGHTS,
+            ),
+            Block(
+                'pose', 2 * links + 1, 'm',
+                'root height above the ground; then x, z of each link centre from the root', PLACES,
+            ),
+            Block('velocity', 2 * links, 'm/s', 'x, z velocity of each link centre', SPEEDS),
+            Block(
+                'strain', len(muscles), '1', 'strain of each muscle fibre', Noise((0.003, 0.01, 0.02)),
+            ),
+        )  # fmt: skip
+
+    def _add_sensor(self, link: str, kind: str) -> str:
+        """Adds a sensor of the contacts between a link and the ground; returns its name."""
+        name = f'{self.character.mjcf_model.model}_{link}_{kind}'
+        body = self.character.mjcf_model.find('body', link)
+        contact = {'body1': body, 'body2': self.arena.ground_body, 'num': 1, 'data': 'found'}
+        self.arena.mjcf_model.sensor.add('contact', name=name, **contact)
+        return name
+
+    def bind(
+        self,
+        world: World,
+        action_map: ActionMap,
+        observation: np.ndarray,
+        observed: tuple[Block, ...],
+        about: str = 'com',
+    ) -> None:
+        """Resolves ids in a compiled world.
+
+        Args:
+          world: the simulations.
+          action_map: the map from actions to the actuators of the joints.
+          observation: array to which the body's blocks are written, (n, ...).
+          observed: the blocks of this array, of which some are the body's.
+          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
+        """
+        self._bind(world)
+        character = self.character
+        scope = f'{character.mjcf_model.model}/'
+        names = [f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')]
+        names += [joint.full_identifier for joint in character.joints]
+        self.pose_qpos, self.pose_dof = world.joint_addresses(names)
+        turning = self.pose_dof[2:].copy()
+        self.columns = feature_columns(0, len(turning), len(turning), len(self.effectors))
+        ids = PlanarIds(
+            qpos=self.pose_qpos,
+            dof=self.pose_dof,
+            turning=turning,
+            links=self.links,
+            effectors=self.effectors,
+            share=self._share,
+            about_com=about == 'com',
+            samples=self._samples,
+            fall=world.sensor_addresses(self._fall_sensors).astype(int),
+            contact=world.sensor_addresses(self._contact_sensors).astype(int),
+            rest=np.array([hill.rest_length(muscle) for muscle in self._muscles]),
+            scale=np.array([hill.optimal_length(muscle) for muscle in self._muscles]),
+        )
+        ground, using = self.arena.ground, (action_map, observation, observed)
+        self._use(PlanarBodyData, ids, PlanarState, ground, *using)
+
+    def recentre(self, env_ids: np.ndarray) -> None:
+        self.arena.recentre(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
+
+    def place(
+        self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray
+    ) -> None:
+        """Places the bodies of some simulations on the ground, at x = 0.
+
+        Each is raised until the bounding boxes of all collision geoms are above the ground, at the
+        middle and both ends of each; never lowered.
+
+        Args:
+          env_ids: indices of simulations, whose physics has been reset.
+          poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); x and
+            z are overwritten with those of the placement.
+          rates: velocities, (m, 3 + J).
+          extents: extents of the collision geoms in these poses, relative to the root, (m, 3, G);
+            see `trl_suite.bodies.reference.link_extents`.
+        """
+        put_down_all(env_ids, poses, rates, extents, self.pack)
+        self._world.forward(env_ids)
+
+    def heights(self, env_ids: np.ndarray, places: np.ndarray) -> np.ndarray:
+        return self.arena.height(places[:, :1], env_ids)[:, 0]
+
+    def level_ground(self, n: int) -> PlanarWindows:
+        ground = planar_ground.empty(n)
+        ground.start[:] = 0.0
+        return ground
+
+    def ground_heights(self, env_id: int, x: np.ndarray) -> np.ndarray:
+        """Returns heights of the ground of one simulation at x (k,), m."""
+        return self.arena.height(x[None], slice(env_id, env_id + 1))[0]
+
+
+@compiled
+def put_down_all(
+    env_ids: np.ndarray,
+    poses: np.ndarray,
+    rates: np.ndarray,
+    extents: np.ndarray,
+    body: PlanarBodyData,
+) -> None:
+    """Writes poses and velocities of bodies placed at x = 0; see `PlanarBody.place`."""
+    ids, physics, ground = body.ids, body.physics, body.ground
+    for row in range(len(env_ids)):
+        i = env_ids[row]
+        height = poses[row, 1] + planar_ground.height(i, 0.0, ground)
+        lift = 0.0
+        for k in range(extents.shape[2]):
+            centre, half = extents[row, 0, k], extents[row, 1, k]
+            level = planar_ground.height(i, centre - half, ground)
+            level = max(level, planar_ground.height(i, centre, ground))
+            level = max(level, planar_ground.height(i, centre + half, ground))
+            depth = level - (height + extents[row, 2, k])
+            lift = max(lift, depth + CLEARANCE)
+        poses[row, 0], poses[row, 1] = 0.0, height + lift
+        for k in range(len(ids.qpos)):
+            physics.qpos[i, ids.qpos[k]] = poses[row, k]
+            physics.qvel[i, ids.dof[k]] = rates[row, k]

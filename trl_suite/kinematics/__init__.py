@@ -1,1 +1,0 @@
-"""Kinematics of characters for tasks: positions, velocities and contacts relative to the ground."""

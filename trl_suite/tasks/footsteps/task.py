@@ -1,0 +1,449 @@
+"""Walking along planned footsteps, in the plane or in space: the low-level footstep controllers.
+
+Source: the step scenario of the original, with its configurations for planar and spatial bipeds;
+'DeepLoco: dynamic locomotion skills using hierarchical deep reinforcement learning' (Peng, Berseth, Yin,
+van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.bodies.body import Measurement
+from trl_suite.bodies.reference import Reference
+from trl_suite.bodies.state import allocated
+from trl_suite.characters import Character, CharacterSpec
+from trl_suite.engine import World
+from trl_suite.motion import Clip, FootstepLibrary, quaternion, step_features
+from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig, check_cycle, cycle_poses
+from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
+from trl_suite.tasks.common.footstep_plan import (
+    CONTACT,
+    LEFT,
+    PLAN,
+    RIGHT,
+    FootstepPlan,
+    Planned,
+    check_two_feet,
+    plan_markers,
+)
+from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
+from trl_suite.tasks.common.plans import (
+    FOOTSTEP_SCALE,
+    MAX_LANDING_ERROR,
+    Plans,
+    Pushes,
+    StraightPlans,
+)
+from trl_suite.tasks.footsteps.planner import Planner
+from trl_suite.tasks.footsteps.rules import (
+    PLANAR_TERMS,
+    TERMS,
+    FootstepData,
+    FootstepState,
+    finish_all,
+    land_all,
+    observe_all,
+)
+from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
+from trl_suite.tasks.tracking import TrackingTask
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import Range, option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarFootstepsConfig(PlanarConfig):
+    """Options of `PlanarFootsteps`."""
+
+    plans: StraightPlans = option(
+        None, 'how footstep plans are drawn: a mapping of fields of StraightPlans'
+    )
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    footstep_scale: float = option(1.0, FOOTSTEP_SCALE, at_least=0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialFootstepsConfig(MirroredConfig):
+    """Options of `SpatialFootsteps`."""
+
+    plans: Plans = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
+    goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
+    pushes: Pushes | None = option(
+        None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
+    )
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    grace_period: float = option(
+        0.0, 'time after a push or a sharp turn in which landing errors do not end the episode', unit='s',
+        at_least=0,
+    )  # fmt: skip
+    footstep_scale: float | Sequence[float] = option(
+        1.0, f'{FOOTSTEP_SCALE}; with several values, the term is the mean over them', at_least=0
+    )
+    heading_scale: float = option(
+        1.0, 'factor of the error of the heading in the reward', at_least=0
+    )
+    hidden_plan: bool = option(
+        False,
+        'observe bearing and distance of a fixed goal instead of contact and plan, although the reward '
+        "depends on the plan, as in the original's 'Hard' environments",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hidden_plan and self.mirrored:
+            raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
+
+
+class Footsteps(Planned, TrackingTask):
+    """A biped tracks a plan of footsteps, two steps per cycle of its clock.
+
+    Attributes:
+      plans: how they are drawn.
+      state: further state of the task.
+    """
+
+    ABOUT = 'root'
+    plans: Any  # Plans or StraightPlans
+    pushes: Pushes | None = None
+    goal_given = hidden_plan = False
+    _grace_steps = 0
+
+    def bind(self, world: World) -> None:
+        tracking, n, config = self._bind_tracking(world), world.n, self.config
+        self.plan, self.state = allocated(FootstepPlan, n), allocated(FootstepState, n)
+        self.saved = (*self.saved, self.plan, self.state)
+        self.info_arrays |= {
+            name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
+        }
+        self._planner = Planner(
+            self._drawn_plans(),
+            self.figure,
+            self.plan,
+            self.state,
+            self.clock,
+            self._random,
+            goals=self.goal_given,
+            grace_steps=self._grace_steps,
+        )
+        limit = config.max_landing_error
+        data = FootstepData(
+            tracking=tracking,
+            plan=self.plan,
+            state=self.state,
+            turns=self.character.spec.spatial,
+            footstep_scales=np.atleast_1d(config.footstep_scale).astype(float),
+            heading_scale=float(getattr(config, 'heading_scale', 1.0)),
+            largest_miss=np.inf if limit is None else float(limit),
+        )
+        self._pack = packed(data)
+
+    def _drawn_plans(self) -> Plans:
+        """Returns how plans are drawn, of spatial characters and of planar ones."""
+        return self.plans
+
+    @property
+    def max_landing_error(self) -> float | None:
+        """Landing error above which an episode fails, m."""
+        return self.config.max_landing_error
+
+    @property
+    def step_phase(self) -> np.ndarray:
+        """Share of the single step that has passed, (n,)."""
+        twice = 2 * self.phase
+        return twice - np.floor(twice)
+
+    # Episodes.
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        measurement, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
+        plan.landed[env_ids] = state.missed[env_ids] = False
+        state.push_end[env_ids] = state.excused[env_ids] = 0
+        if self.pushes:
+            for i in env_ids.tolist():
+                state.push_begin[i] = self._steps_within(i, self.pushes.interval)
+        self._planner.begin(env_ids, self.travel.origin[env_ids], measurement)
+        self._put_reference(env_ids, measurement, self._first_tracks(env_ids))
+
+    def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
+        return round(self._random[i].uniform(*seconds) / self.control_timestep)
+
+    @abc.abstractmethod
+    def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
+        """Returns the tracks of the reference at the start of episodes, (m,)."""
+
+    @abc.abstractmethod
+    def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
+        """Returns the tracks of the reference that are nearest to the plans, (m,)."""
+
+    # A step.
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        measurement = self.figure.measure(env_ids, stepped=True)
+        if land_all(env_ids, self._pack):
+            switched = env_ids[self.plan.landed[env_ids]]
+            self._planner.replan(switched, measurement)
+            self._put_reference(switched, measurement, self._choose(switched, measurement))
+        finish_all(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        self.figure.measure(env_ids)
+        observe_all(env_ids, self._pack)
+
+    def _put_reference(
+        self, env_ids: np.ndarray, measurement: Measurement, tracks: np.ndarray
+    ) -> None:
+        """Aligns tracks (m,) with position and heading of the characters."""
+        state, columns = self.state, self.reference.columns
+        state.track[env_ids] = tracks
+        now = self.reference.features(self.step_phase[env_ids], tracks)
+        turned = measurement.heading[env_ids] - now[:, columns['heading'].start]
+        state.turned[env_ids] = turned
+        state.shift[env_ids] = measurement.root[env_ids, :2] - quaternion.rotate_xy(
+            now[:, columns['root']], turned
+        )
+
+
+class SpatialFootsteps(Footsteps):
+    """A spatial biped tracks a plan of footsteps.
+
+    With the option `mirrored`, observations and actions are reflected in left stance; the phase is
+    then that of the single step, and the plan has only the landing places that are not 0.
+    """
+
+    terms = TERMS
+
+    CONFIG: Any = SpatialFootstepsConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        steps: FootstepLibrary,
+        config: SpatialFootstepsConfig = SpatialFootstepsConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: the arena with its terrain.
+          steps: library of single steps of this character; the clock has the period of two steps.
+          config: the options; with action_offset 'clip', action 0 is the mean pose of a straight
+            step.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: incompatible options, or steps that do not fit the character.
+        """
+        check_two_feet(character.spec)
+        self.plans, self.pushes, self.steps = config.plans, config.pushes, steps
+        self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
+        self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
+        # Episodes start from the straight step whose length is nearest to the planned one.
+        self._first = straight_step(steps, float(np.mean(self.plans.length)))
+        super().__init__(
+            character,
+            arena,
+            steps,
+            typical_poses(steps, self._first),
+            config,
+            period=2 * steps.duration,
+            actuation_model=actuation_model,
+            extras=(CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)),
+            hidden=('contact', 'plan') if config.hidden_plan else (),
+        )
+
+    def bind(self, world: World) -> None:
+        super().bind(world)
+        self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
+
+    def _track(self) -> Reference:
+        return Reference.of_steps(self.steps, self.figure, self.world.models[0])
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Position of the goal, (n, 3) m."""
+        return self.state.goal
+
+    # Episodes.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = self._begin_grounds(env_ids, random_states)
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        super()._begun_on_ground(env_ids)
+        if self.hidden_plan:
+            for i in env_ids.tolist():
+                place = self.travel.origin[i, :2]
+                self.state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
+
+    def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
+        return self._first + len(self.steps) * (self.stance[env_ids] == LEFT)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        super().apply_action(action, env_ids)
+        if self.pushes:
+            self._push(env_ids, self.pushes)
+
+    def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
+        """Draws pushes that begin, and applies the forces."""
+        state, count = self.state, self.clock.steps
+        for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
+            angle = self._random[i].uniform(-np.pi, np.pi)
+            force = self._random[i].uniform(*pushes.force)
+            state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
+            state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
+            state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
+            state.excused[i] = state.push_end[i] + self._grace_steps
+        pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
+        self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
+
+    def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
+        feet = measurement.feet[env_ids]
+        query = step_features(
+            measurement.root[env_ids, :2],
+            measurement.heading[env_ids],
+            feet[:, RIGHT, :2],
+            feet[:, LEFT, :2],
+            self.landing[env_ids, 0, :2],
+            self.heading[env_ids],
+            self.stance[env_ids] == RIGHT,
+        )
+        return self.steps.select(query) + len(self.steps) * (self.stance[env_ids] == LEFT)
+
+    # Rendering.
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Returns markers of the landing places, the planned heading and the goal."""
+        root = self.world.xpos[env_id, self.figure.links[0]]
+        shown = plan_markers(env_id, root, self.plan)
+        if self.goal_given:
+            shown.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
+        if self.hidden_plan:
+            shown.append(flag(self.goal[env_id]))
+        return shown
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Returns the pose of the aligned reference: root, then joints."""
+        state = self.state
+        mirrored, index = divmod(int(state.track[env_id]), len(self.steps))
+        time = self.step_phase[env_id] * self.steps.duration
+        pose = self.steps.pose(index, time, bool(mirrored))
+        turned = state.turned[env_id]
+        pose[:2] = state.shift[env_id] + quaternion.rotate_xy(pose[:2], turned)
+        pose[3:7] = quaternion.multiply(quaternion.about_z(turned), pose[3:7])
+        return self._on_ground(env_id, pose)
+
+
+class PlanarFootsteps(Footsteps):
+    """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip."""
+
+    terms = PLANAR_TERMS
+
+    CONFIG: Any = PlanarFootstepsConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena,
+        clip: Clip,
+        config: PlanarFootstepsConfig = PlanarFootstepsConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a planar character with a right and a left foot, without actuators; it is
+            attached to the arena.
+          arena: the arena with its terrain.
+          clip: a looping planar clip of two steps for this character, with right stance first.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: incompatible options, a character without two feet, or a clip that does not
+            fit it; `bind` raises it for a clip with left stance first.
+        """
+        check_feet(character.spec)
+        check_cycle(clip)
+        self.clip, self.plans = clip, config.plans
+        super().__init__(
+            character,
+            arena,
+            clip,
+            cycle_poses(clip),
+            config,
+            period=clip.duration,
+            actuation_model=actuation_model,
+            extras=(CONTACT, PLAN, GOAL.observed_if(False)),
+        )
+
+    def _drawn_plans(self) -> Plans:
+        length, change = self.plans.length, self.plans.change
+        return Plans(length=length, change=change, width=Range(0.0, 0.0), turn=0.0, sharp=0.0)
+
+    def _track(self) -> Reference:
+        reference = Reference.of_clip(self.clip, self.figure, self.world.models[0], tracks=2)
+        shares, columns = np.arange(32) / 32, reference.columns['effectors']
+        halves = [reference.features(shares, np.full(32, half))[:, columns] for half in (0, 1)]
+        # Right above left foot, by halves.
+        higher = [(feet[:, 2] - feet[:, 5]).mean() for feet in halves]
+        if not higher[0] < 0 < higher[1]:
+            raise ValueError(
+                f'clip {self.clip.name!r}: expected the right foot on the ground in the first half of '
+                'the cycle, and the left foot in the second; if the left foot is first, pass '
+                'clip.mirrored()'
+            )
+        return reference
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self._clip_start(env_ids, self._begin_grounds(env_ids, random_states), tracks=2)
+
+    def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
+        return self.stance[env_ids]
+
+    def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
+        return self.stance[env_ids]
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Returns markers of the landing places."""
+        return plan_markers(env_id, np.zeros(3), self.plan)[:2]
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Returns the reference pose, aligned with x at the last switch: x, z, pitch, joints."""
+        time = (self.state.track[env_id] + self.step_phase[env_id]) / 2 * self.period
+        pose = self.clip.pose(time)
+        pose[0] += self.state.shift[env_id, 0]
+        return self._on_ground(env_id, pose)
+
+
+def check_feet(character: CharacterSpec) -> None:
+    """Checks that a character has a right and a left foot, and no others.
+
+    Raises:
+      ValueError: the character has no such pair of end effectors.
+    """
+    if character.end_effectors not in character.mirror:
+        raise ValueError(
+            f'character {character.name!r} has '
+            f'{", ".join(character.end_effectors) or "nothing"} as end effectors; expected a right and a left '
+            'foot, as biped2d_full has'
+        )
