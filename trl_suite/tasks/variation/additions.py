@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.engine import World
 from trl_suite.bodies.blocks import Block
+from trl_suite.engine import World
 from trl_suite.tasks.component import Component
-from trl_suite.tasks.terms import Outcome
+from trl_suite.tasks.terms import Outcome, outcome
 from trl_suite.util import errors
 
 if TYPE_CHECKING:
@@ -87,19 +87,18 @@ class Additions(Component):
         label = ', '.join(name for group in added for name in group)
         return {'additions': (label, added)}
 
-    def bind(self, world: World, outcome: Outcome) -> Outcome:
+    def bind(self, world: World, inner: Outcome) -> Outcome:
         n, task = world.n, self.task
-        self._inner, self._own = outcome, outcome.observation.shape[1]
+        self._inner, self._own = inner, inner.observation.shape[1]
+        terms = inner.reward_terms.shape[1]
         size = sum(block.size for block in self.blocks)
-        self._outcome = Outcome(
-            np.zeros((n, self._own + size)), np.zeros(n), np.zeros((n, 0)), *np.zeros((3, n), bool)
-        )
-        self.action = task.action = np.zeros((n, len(task.action_map)))  # type: ignore[attr-defined]
-        self._terms = np.zeros((n, len(self._rewards)))
-        self.saved = (_Saved(self.action, self._terms), self._outcome)
+        self._outcome = outcome(n, self._own + size, terms + len(self._rewards))
+        self._terms = self._outcome.reward_terms[:, terms:]
+        self.action = task.action = np.zeros((n, len(task.action_map)))
+        self.saved = (_Saved(self.action), self._outcome)
         self.info_arrays = {'reward_terms': dict(zip(self._rewards, self._terms.T, strict=True))}
         if self.blocks:
-            task.mirror = None  # type: ignore[attr-defined]  # unknown for the added blocks
+            task.mirror = None  # unknown for the added blocks
         return self._outcome
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
@@ -107,27 +106,29 @@ class Additions(Component):
 
     def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
         """Adds the custom reward terms, blocks and failures to the outcome of the task."""
-        inner, outcome = self._inner, self._outcome
+        inner, out = self._inner, self._outcome
         if fresh:
             self.action[env_ids] = self._terms[env_ids] = 0.0
-        outcome.diverged[env_ids] = inner.diverged[env_ids]
-        outcome.observation[env_ids, : self._own] = inner.observation[env_ids]
-        usable, column = env_ids[~outcome.diverged[env_ids]], self._own
+        out.diverged[env_ids] = inner.diverged[env_ids]
+        out.observation[env_ids, : self._own] = inner.observation[env_ids]
+        out.reward_terms[env_ids, : inner.reward_terms.shape[1]] = inner.reward_terms[env_ids]
+        usable, column = env_ids[~out.diverged[env_ids]], self._own
         for name, (size, function) in self._extras.items():
             value = self._ask('observation', name, function, size)
-            outcome.observation[usable, column : column + size] = value[usable]
+            out.observation[usable, column : column + size] = value[usable]
             column += size
-        outcome.reward[env_ids] = inner.reward[env_ids]
-        outcome.failed[env_ids] = failed = inner.failed[env_ids]
+        out.reward[env_ids] = inner.reward[env_ids]
+        out.failed[env_ids] = failed = inner.failed[env_ids]
+        out.fell[env_ids] = inner.fell[env_ids]
         if fresh:
             return
         for k, (name, (weight, function)) in enumerate(self._rewards.items()):
             value = self._ask('reward', name, function, 1)[env_ids, 0]
             self._terms[env_ids, k] = np.where(failed, 0.0, weight * value)
-            outcome.reward[env_ids] += self._terms[env_ids, k]
+            out.reward[env_ids] += self._terms[env_ids, k]
         for name, function in self._failures.items():
             failed = failed | (self._ask('failure', name, function, 1)[env_ids, 0] != 0)
-        outcome.failed[env_ids] = failed
+        out.failed[env_ids], out.fell[env_ids] = failed, failed & ~out.diverged[env_ids]
 
     def _ask(self, kind: str, name: str, function: Function, size: int) -> np.ndarray:
         """Returns the checked value of a custom function, (n, size).
@@ -152,10 +153,9 @@ class Additions(Component):
 
 
 class _Saved(NamedTuple):
-    """Last action, and terms of the reward, (n, ...)."""
+    """Last action, (n, k)."""
 
     action: np.ndarray
-    terms: np.ndarray
 
 
 def additions(parts: Mapping[str, Any]) -> Additions:
