@@ -159,9 +159,15 @@ def weight(
 
 @compiled
 def write_jacobian(
-    i: int, body: int, x: float, z: float, row: int, skeleton: Skeleton, xanchor: np.ndarray,
+    i: int,
+    body: int,
+    x: float,
+    z: float,
+    row: int,
+    skeleton: Skeleton,
+    xanchor: np.ndarray,
     out: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """Writes d(x, z) / d(degrees of freedom) of a point of a body to two rows of out[i], (., D).
 
     The rows are `row` and the next one. The columns of slides other than those of the root are

@@ -40,9 +40,7 @@ class Outcome(NamedTuple):
 
 def outcome(n: int, size: int, terms: int = 0) -> Outcome:
     """Allocates the outcome of n simulations, for a size of observations and a number of terms."""
-    return Outcome(
-        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
-    )  # fmt: skip
+    return Outcome(np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool))
 
 
 @compiled
@@ -96,10 +94,13 @@ class TermData(NamedTuple):
 
 def terms_data(terms: Iterable[Term]) -> Any:
     """Returns a named tuple with the `TermData` of each term, by name."""
-    return by_name('Terms', {
-        term.name: TermData(k, float(term.weight), float(term.scale or 0.0))
-        for k, term in enumerate(terms)
-    })  # fmt: skip
+    return by_name(
+        'Terms',
+        {
+            term.name: TermData(k, float(term.weight), float(term.scale or 0.0))
+            for k, term in enumerate(terms)
+        },
+    )
 
 
 @compiled

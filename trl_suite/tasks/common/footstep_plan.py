@@ -30,7 +30,9 @@ CONTACT = Block(
 # Of a reflected plan, the landing places of the two feet are exchanged. Mirrored observations keep the
 # heading, the first landing place from the left foot, and the second from the right foot.
 PLAN = Block(
-    'plan', PLAN_SIZE, 'm, rad',
+    'plan',
+    PLAN_SIZE,
+    'm, rad',
     'x, y, and z above the ground under the root: of the first landing place from the right foot (0 in '
     'right stance) and from the left foot (0 in left stance), of the second from the right foot (0 in left '
     'stance) and from the left foot (0 in right stance); then the planned heading relative to the current '
@@ -44,7 +46,7 @@ PLAN = Block(
     kept_meaning='planned heading relative to the current one, positive to the swing side; then x, y, and z '
     'above the ground under the root: of the first landing place from the swing foot, of the second from '
     'the stance foot',
-)  # fmt: skip
+)
 SOLE, SOLE_AHEAD = (
     (0.0885, 0.045, 0.004),
     0.052,
@@ -136,9 +138,11 @@ def observe_plan(
     for which in range(2):
         foot = plan.stance[i] if which else 1 - plan.stance[i]
         ahead, left = ahead_and_left(
-            i, plan.landing[i, which, 0] - measurement.feet[i, foot, 0],
-            plan.landing[i, which, 1] - measurement.feet[i, foot, 1], measurement,
-        )  # fmt: skip
+            i,
+            plan.landing[i, which, 0] - measurement.feet[i, foot, 0],
+            plan.landing[i, which, 1] - measurement.feet[i, foot, 1],
+            measurement,
+        )
         slot = column + 6 * which + 3 * foot
         observation[i, slot], observation[i, slot + 1] = ahead, left
         observation[i, slot + 2] = plan.landing[i, which, 2] - measurement.under[i]

@@ -38,9 +38,13 @@ class Goals(NamedTuple):
 
 
 GOAL = Block(
-    'goal', 2, 'rad, m', 'bearing (positive to the left) and distance of the goal',
-    Noise((0.01, 0.03, 0.1)), signs((-1.0, 1.0)),
-)  # fmt: skip
+    'goal',
+    2,
+    'rad, m',
+    'bearing (positive to the left) and distance of the goal',
+    Noise((0.01, 0.03, 0.1)),
+    signs((-1.0, 1.0)),
+)
 
 
 def flag(goal: Any) -> Marker:

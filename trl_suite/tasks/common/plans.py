@@ -42,22 +42,29 @@ class Plans(Config):
         0.1, 'probability that length and width of a step are redrawn', at_least=0, at_most=1
     )
     turn: float = option(
-        0.25, 'standard deviation of the change of heading from one step to the next', unit='rad',
+        0.25,
+        'standard deviation of the change of heading from one step to the next',
+        unit='rad',
         at_least=0,
-    )  # fmt: skip
+    )
     sharp: float = option(
         0.1, 'probability of a sharp turn instead, drawn from [-pi, pi)', at_least=0, at_most=1
     )
     from_root: float = option(
-        0.0, 'probability that a plan is relative to position and heading of the root, as the plans of a '
-        'high-level controller are', at_least=0, at_most=1,
-    )  # fmt: skip
+        0.0,
+        'probability that a plan is relative to position and heading of the root, as the plans of a '
+        'high-level controller are',
+        at_least=0,
+        at_most=1,
+    )
     root_length: Range = option(Range(0.2, 0.7), 'length of its steps', unit='m', at_least=0)
     root_width: Range = option(Range(0.08, 0.28), 'width of its steps', unit='m', at_least=0)
     root_turn: float = option(
-        0.3, f'standard deviation of its turn from the current heading; clipped to +-{ROOT_TURN_LIMIT}',
-        unit='rad', at_least=0,
-    )  # fmt: skip
+        0.3,
+        f'standard deviation of its turn from the current heading; clipped to +-{ROOT_TURN_LIMIT}',
+        unit='rad',
+        at_least=0,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,6 +77,8 @@ class Pushes(Config):
     force: Range = option(Range(50.0, 150.0), 'force', unit='N', at_least=0)
     duration: Range = option(Range(0.2, 0.4), 'duration of a push', unit='s', at_least=0)
     interval: Range = option(
-        Range(1.0, 2.0), 'time from the end of a push, or the start of the episode, to the next push',
-        unit='s', at_least=0,
-    )  # fmt: skip
+        Range(1.0, 2.0),
+        'time from the end of a push, or the start of the episode, to the next push',
+        unit='s',
+        at_least=0,
+    )

@@ -136,13 +136,17 @@ def observe_phase(i: int, columns: Any, clock: Clock, observation: np.ndarray) -
 
 # Its phase is that of the cycle; a mirrored observation has that of the step.
 PHASE = Block(
-    'phase', 1 + PHASE_BINS, '1', 'phase of the cycle in [0, 1); then the one-hot of its quarter', CLOCK,
+    'phase',
+    1 + PHASE_BINS,
+    '1',
+    'phase of the cycle in [0, 1); then the one-hot of its quarter',
+    CLOCK,
     Reflection(
         np.append(0, 1 + np.roll(np.arange(PHASE_BINS), PHASE_BINS // 2)), np.ones(1 + PHASE_BINS)
     ),
     kept=tuple(range(1 + PHASE_BINS // 2)),
     kept_meaning='phase of the step in [0, 1); then the one-hot of its half',
-)  # fmt: skip
+)
 
 
 @compiled

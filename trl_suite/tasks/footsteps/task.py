@@ -79,9 +79,11 @@ class SpatialFootstepsConfig(MirroredConfig):
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     grace_period: float = option(
-        0.0, 'time after a push or a sharp turn in which landing errors do not end the episode', unit='s',
+        0.0,
+        'time after a push or a sharp turn in which landing errors do not end the episode',
+        unit='s',
         at_least=0,
-    )  # fmt: skip
+    )
     footstep_scale: float | Sequence[float] = option(
         1.0, f'{FOOTSTEP_SCALE}; with several values, the term is the mean over them', at_least=0
     )

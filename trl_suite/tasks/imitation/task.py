@@ -93,15 +93,18 @@ def motion_blocks(character: Character, reference: bool) -> tuple[Block, ...]:
     numbers = 1 + (6 if spec.spatial else 4) * len(spec.links)
     return (
         Block(
-            'reference', numbers if reference else 0, 'm, m/s',
+            'reference',
+            numbers if reference else 0,
+            'm, m/s',
             'root height, link centres from the root, and velocities of link centres of the reference',
             'the reference is known to the controller',
         ),
         dataclasses.replace(
-            GOAL, meaning='bearing (positive to the left) and distance of the point 3 m ahead on the line '
+            GOAL,
+            meaning='bearing (positive to the left) and distance of the point 3 m ahead on the line '
             'along +x through the start',
         ).observed_if(spec.spatial),
-    )  # fmt: skip
+    )
 
 
 # Loops over simulations; they take packs.

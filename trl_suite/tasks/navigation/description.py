@@ -114,10 +114,13 @@ def _full_with_ball(task: Any) -> str:
 
 
 DIRECT = Description(
-    rules=about_joints, legend=_BEADS,
-)  # fmt: skip
+    rules=about_joints,
+    legend=_BEADS,
+)
 HIERARCHICAL = Description(
-    rules=about_plans, action=action,
-    time=time, joints=lambda task: ('', [''] * len(task.character.spec.joints)),
+    rules=about_plans,
+    action=action,
+    time=time,
+    joints=lambda task: ('', [''] * len(task.character.spec.joints)),
     legend=LEGEND + _BEADS,
-)  # fmt: skip
+)

@@ -117,8 +117,9 @@ class HierarchicalConfig(Config):
         None,
         f'distance within which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
         f'by default {AT_GOAL:g}',
-        unit='m', above=0,
-    )  # fmt: skip
+        unit='m',
+        above=0,
+    )
     goal_distance: Range | None = option(
         None,
         'minimum and maximum distance of goals from the walker, or the ball, in any direction; by default '
@@ -207,9 +208,12 @@ class HierarchicalNavigation(Planned, ClockedTask):
         self.action_map = plan_action_map(self.step_length, None if by_plan else self.joint_map)
         terrain, *body = body_blocks(character, 'height' in config.terrain_observation)
         controller = Block(
-            'low_level', sum(block.size for block in self._controller_blocks), '',
-            'observation of the footstep controller', 'the footstep controller has its own observation',
-        )  # fmt: skip
+            'low_level',
+            sum(block.size for block in self._controller_blocks),
+            '',
+            'observation of the footstep controller',
+            'the footstep controller has its own observation',
+        )
         self.observed = (
             terrain,
             SURFACE.observed_if('velocity' in config.terrain_observation),
@@ -381,5 +385,7 @@ class HierarchicalNavigation(Planned, ClockedTask):
         root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
         there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [
-            *plan_markers(env_id, root, self.plan), *trace_markers(env_id, self.trace), there,
-        ]  # fmt: skip
+            *plan_markers(env_id, root, self.plan),
+            *trace_markers(env_id, self.trace),
+            there,
+        ]

@@ -43,22 +43,23 @@ SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # constant reward of a step without a fall
 NAVIGATION_TERMS = (
     Term(
-        'speed', 1 - UPRIGHT,
+        'speed',
+        1 - UPRIGHT,
         f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2), v: speed of the centre of mass towards the '
         'goal, m/s',
     ),
     Term('upright', UPRIGHT, '1'),
-)  # fmt: skip
+)
 SURFACE = Block(
-    'surface', 2 * SAMPLES**2, 'm/s',
+    'surface',
+    2 * SAMPLES**2,
+    'm/s',
     'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
     'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then all '
     'components to the right',
     HEIGHTS._replace(bias=(0.0, 0.0, 0.0)),
-    Reflection(
-        np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)
-    ),
-)  # fmt: skip
+    Reflection(np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)),
+)
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
 FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 LONGEST = 60  # limit of control steps per step; the clock switches stance long before

@@ -34,21 +34,26 @@ class CommonOptions(Config):
     """Options of every task, in addition to its own and to `ADDITIONS`."""
 
     randomize: WorldConfig | None = option(
-        None, "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a "
+        None,
+        "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a "
         'dict, see docs/realism.md',
-    )  # fmt: skip
+    )
     sensors: SensorConfig | None = option(
-        None, "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
+        None,
+        "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
         'docs/realism.md',
-    )  # fmt: skip
+    )
     actuators: Actuators = option(
-        None, 'limits, delay, noise, strength, free play and elasticity of motors: a dict, see '
+        None,
+        'limits, delay, noise, strength, free play and elasticity of motors: a dict, see '
         'docs/realism.md',
-    )  # fmt: skip
+    )
     levels: Sequence[int] | None = option(
-        None, 'the first level and the number of levels from which every episode draws one; a level is the '
-        'seed of its terrain', at_least=0,
-    )  # fmt: skip
+        None,
+        'the first level and the number of levels from which every episode draws one; a level is the '
+        'seed of its terrain',
+        at_least=0,
+    )
 
     def __post_init__(self) -> None:
         for name in ('randomize', 'sensors'):

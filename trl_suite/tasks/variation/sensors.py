@@ -39,23 +39,24 @@ class SensorConfig(Config):
         None,
         'standard deviation of Gaussian noise in every step, in the units of the block; for `contact`, the '
         'probability that a flag is wrong; by default 0, or that of the preset',
-    )  # fmt: skip
+    )
     bias: Any = option(
         None,
         'standard deviation of a Gaussian offset, drawn at the start of an episode for each number of a '
         'block; a map of the ground has a single one; by default 0, or that of the preset',
-    )  # fmt: skip
+    )
     terrain_dropout: float | None = option(
         None,
         'probability that a number of a map of the ground is missing in a step; it is then observed as 0, '
         'the height of the ground under the root; by default 0, or that of the preset',
-        at_least=0, at_most=1,
-    )  # fmt: skip
+        at_least=0,
+        at_most=1,
+    )
     delay: Any = option(
         None,
         'age of what is observed, in steps of the environment (in gaits, cycles); a pair of bounds: drawn '
         'for each episode and block; by default 0, or that of the preset if steps last 1/30 s',
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
