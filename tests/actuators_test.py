@@ -4,20 +4,18 @@ import copy
 import dataclasses
 import json
 import pathlib
-import pickle
 import tempfile
 
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
-from dm_control import composer, mjcf
+from dm_control import mjcf
+from helpers import assert_refused
 
 from trl_suite import actuation, characters, describe, suite
 from trl_suite.actuation import realism, series, strength_curves
-from trl_suite.describe.options import table_of
 from trl_suite.engine import BatchWorld, motors
 from trl_suite.engine.world import STATE
-from trl_suite.util import tables
 from trl_suite.vector import VectorEnvironment
 
 PLANAR = 'PD_Biped2D_LLC_Imitate_Flat-v0'
@@ -26,17 +24,10 @@ MUSCLE = 'MTU_Biped2D_LLC_Imitate_Flat-v0'
 GAIT = 'FSM_Dog2D_Terrain_Gaps-v0'
 CHARACTERS = ('biped2d', 'biped3d')
 MODELS = ('torque', 'velocity', 'position')
-EACH = {
-    'torque_speed': {'torque_speed': True, 'no_load_speed': 8.0},
-    'strength': {'strength': (0.7, 1.3)},
-    'noise': {'noise': 0.1},
-    'delay': {'delay': (0, 60)},
-    'torque_pose': {'torque_pose': True},
-    'flex': {'flex': 0.05},
-    'backlash': {'backlash': 0.02},
-}
-NOT_FOR_MUSCLES = ('torque_speed', 'no_load_speed', 'torque_pose', 'flex', 'backlash')
-ALL = {name: value for options in EACH.values() for name, value in options.items()}
+ALL = {
+    'torque_speed': True, 'no_load_speed': 8.0, 'strength': (0.7, 1.3), 'noise': 0.1, 'delay': (0, 60),
+    'torque_pose': True, 'flex': 0.05, 'backlash': 0.02,
+}  # fmt: skip
 
 
 def make(character='biped2d', model='position', task='imitation', **options):
@@ -84,77 +75,56 @@ def lateral(quaternion):
     return -vector[1]
 
 
+REFUSED = (  # environment, options
+    (PLANAR, {'torque_sped': True}, "did you mean 'torque_speed'"),
+    (PLANAR, {'delay': -1}, 'delay is -1'),
+    (PLANAR, {'delay': 5000}, 'from 0 to 1000, in ms'),
+    (PLANAR, {'delay': (30, 10)}, 'a lower and an upper bound'),
+    (PLANAR, {'delay': (1, 2, 3)}, 'a lower and an upper bound'),
+    (PLANAR, {'noise': 2}, 'from 0 to 0.5'),
+    (PLANAR, {'strength': (1, 10)}, 'at most 2'),
+    (PLANAR, {'torque_speed': True, 'no_load_speed': 0.5}, 'at least 1, in rad/s'),
+    (PLANAR, {'noise': float('nan')}, 'noise is nan'),
+    (PLANAR, {'strength': 0}, 'strength is 0'),
+    (PLANAR, {'strength': 'weak'}, 'strength'),
+    (PLANAR, {'torque_speed': 1}, 'True or False'),
+    (PLANAR, {'no_load_speed': 5.0}, 'no effect without torque_speed'),
+    (PLANAR, {'backlash': 0.6}, 'from 0 to 0.5, in rad'),
+    (PLANAR, {'flex': -0.1}, 'flex is -0.1'),
+    (PLANAR, {'flex': 0.1, 'flex_damping': -0.001}, 'from 0 to 1, in s'),
+    (PLANAR, {'flex_damping': 0.1}, 'no effect without flex'),
+    (PLANAR, {'braking': 2.0}, 'no effect without torque_speed'),
+    (PLANAR, {'torque_pose': 'no such file.json'}, 'cannot read the table'),
+    (PLANAR, {'torque_pose': 3}, 'expected True'),
+    (PLANAR, {'torque_pose': {'right_nee': {}}}, "did you mean 'right_knee'"),
+    (PLANAR, {'torque_pose': {'right_knee': {'angle': [0, 1]}}}, 'angle, positive, negative'),
+    (PLANAR, {'torque_pose': {'right_knee': {'angle': [0, 0], 'positive': [1, 1], 'negative': [1, 1]}}}, 'ascending order'),
+    (PLANAR, {'torque_pose': {'right_knee': {'angle': [0, 1], 'positive': [1, 1], 'negative': [1, -1]}}}, 'from 0 to 10'),
+    (PLANAR, [1], 'expected a dict of options'),
+    *((MUSCLE, {name: value}, f'{name} is not an option of muscle control') for name, value in (
+        ('torque_speed', True), ('torque_pose', True), ('flex', 0.1), ('backlash', 0.1))),
+    (GAIT, {'delay': (0, 3)}, 'at most 2 ms for a gait'),
+    ('PD_Dog2D_Flat-v0', {'torque_pose': True}, "'dog' has no curves of its own"),
+)  # fmt: skip
+
+
 class OptionsTest(parameterized.TestCase):
-    @parameterized.parameters(
-        ({'torque_sped': True}, "did you mean 'torque_speed'"),
-        ({'delay': -1}, 'delay is -1'),
-        ({'delay': 5000}, 'from 0 to 1000, in ms'),
-        ({'delay': (30, 10)}, 'a lower and an upper bound'),
-        ({'delay': (1, 2, 3)}, 'a lower and an upper bound'),
-        ({'noise': 2}, 'from 0 to 0.5'),
-        ({'strength': (1, 10)}, 'at most 2'),
-        ({'torque_speed': True, 'no_load_speed': 0.5}, 'at least 1, in rad/s'),
-        ({'noise': float('nan')}, 'noise is nan'),
-        ({'strength': 0}, 'strength is 0'),
-        ({'strength': 'weak'}, 'strength'),
-        ({'torque_speed': 1}, 'True or False'),
-        ({'no_load_speed': 5.0}, 'no effect without torque_speed'),
-        ({'backlash': 0.6}, 'from 0 to 0.5, in rad'),
-        ({'flex': -0.1}, 'flex is -0.1'),
-        ({'flex': 0.1, 'flex_damping': -0.001}, 'from 0 to 1, in s'),
-        ({'flex_damping': 0.1}, 'no effect without flex'),
-        ({'braking': 2.0}, 'no effect without torque_speed'),
-        ({'torque_pose': 'no such file.json'}, 'cannot read the table'),
-        ({'torque_pose': 3}, 'expected True'),
-        ({'torque_pose': {'right_nee': {}}}, "did you mean 'right_knee'"),
-        ({'torque_pose': {'right_knee': {'angle': [0, 1]}}}, 'angle, positive, negative'),
-        (
-            {'torque_pose': {'right_knee': {'angle': [0, 0], 'positive': [1, 1], 'negative': [1, 1]}}},
-            'ascending order',
-        ),
-        (
-            {'torque_pose': {'right_knee': {'angle': [0, 1], 'positive': [1, 1], 'negative': [1, -1]}}},
-            'from 0 to 10',
-        ),
-        ([1], 'expected a dict of options'),
-    )  # fmt: skip
-    def test_bad_options_are_refused_by_name(self, options, message):
-        with self.assertRaisesRegex(ValueError, message):
-            suite.make(PLANAR, task_kwargs={'actuators': options})
-
-    @parameterized.parameters('torque_speed', 'torque_pose')
-    def test_options_that_muscles_include_are_refused(self, name):
-        with self.assertRaisesRegex(ValueError, f'{name} is not an option of muscle control'):
-            suite.make(MUSCLE, task_kwargs={'actuators': {name: True}})
-
-    @parameterized.parameters('flex', 'backlash')
-    def test_muscles_have_no_gears(self, name):
-        with self.assertRaisesRegex(ValueError, f'{name} is not an option of muscle control'):
-            suite.make(MUSCLE, task_kwargs={'actuators': {name: 0.1}})
-
-    def test_torques_of_gaits_cannot_be_late(self):
-        with self.assertRaisesRegex(ValueError, 'at most 2 ms for a gait'):
-            suite.make(GAIT, task_kwargs={'actuators': {'delay': (0, 3)}})
-
-    @parameterized.parameters('dog', 'raptor', 'biped2d_simbicon', 'hopper')
-    def test_gaits_go_on_with_real_actuators(self, character):
-        options = {
-            'torque_speed': True,
-            'delay': 2,
-            'noise': 0.02,
-            'flex': 0.02,
-            'strength': (0.95, 1.05),
-        }
-        environment = make(character, None, 'gait', **options)
-        for _ in range(2):
-            step = environment.step(np.zeros(len(environment.action_map)))
-        self.assertFalse(environment.info['diverged'])
-        self.assertGreater(environment.info['distance'], 0.5)
-        self.assertTrue(np.isfinite(flat(step)).all())
-
-    def test_a_character_without_curves_has_none(self):
-        with self.assertRaisesRegex(ValueError, "'dog' has no curves of its own"):
-            suite.build('dog', task_kwargs={'actuators': {'torque_pose': True}})
+    def test_refused(self):
+        xml = """<mujoco><worldbody><body name="root"><geom name="root" size=".1"/>
+        <body name="a"><joint name="a" axis="0 1 0" actuatorfrcrange="-1 1"/>
+        <joint name="b" axis="0 1 0" actuatorfrcrange="-1 1"/><geom name="a" size=".1"/></body>
+        </body></worldbody></mujoco>"""
+        spec = characters.CharacterSpec(
+            name='two', joints={'a': characters.Joint(1, 1, 1), 'b': characters.Joint(1, 1, 1)},
+            fall_links=('root',), end_effectors=('a',), stumble_exempt=(), description='', xml=xml,
+            bodies=('root', 'a'),
+        )  # fmt: skip
+        flexible = actuation.Actuators(flex=0.1)
+        assert_refused(
+            self,
+            *((lambda i=i, o=o: suite.make(i, {'actuators': o}), message) for i, o, message in REFUSED),
+            (lambda: realism.body(flexible, spec), 'flex needs one joint for each link'),
+        )  # fmt: skip
 
     def test_ideal_actuators_change_nothing(self):
         ideal = {'delay': 0, 'noise': 0, 'strength': 1, 'torque_pose': False}
@@ -514,29 +484,6 @@ class DelayTest(parameterized.TestCase):
         torque = joint.kp * (target[k] - qpos[own.qposadr[0]]) - kv * qvel[own.dofadr[0]]
         return min(max(torque, -limit), limit)
 
-    def test_delay_equals_mujocos_own(self):
-        # A motor whose first control is 0 from the start, as MuJoCo's history begins with 0.
-        lag, timestep = 23, 0.002
-        xml = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody><body>
-        <joint name="j" axis="0 1 0" damping=".1"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/>
-        </body></worldbody><actuator><motor joint="j" {delay}/></actuator></mujoco>"""
-        own = mujoco.MjModel.from_xml_string(
-            xml.format(delay=f'delay="{lag * timestep}" nsample="40" interp="zoh"')
-        )
-        data = mujoco.MjData(own)
-        world = BatchWorld(mujoco.MjModel.from_xml_string(xml.format(delay='')), 1, 1)
-        state = world.set_motors(motors.limits(), motors.noise(), 0, lag // 5 + 2)
-        state.lag[:] = lag
-        world.forward(world.all_ids)
-        rng, control = np.random.default_rng(0), 0.0
-        for _ in range(40):
-            world.ctrl[:] = data.ctrl[:] = control
-            mujoco.mj_step(own, data, 5)
-            world.step(5)
-            np.testing.assert_allclose(world.qpos[0], data.qpos, atol=1e-12)
-            control = rng.uniform(-1, 1)
-        self.assertGreater(abs(data.qvel[0]), 0.01)
-
     def test_drawn_delays_are_uniform_and_shown(self):
         environments = VectorEnvironment(
             PLANAR, 200, 1, seed=3, task_kwargs={'actuators': {'delay': (10, 50)}}
@@ -638,114 +585,9 @@ class SeriesTest(parameterized.TestCase):
             self.assertGreater(pairs[1], pairs[0])
             given.step(np.zeros(len(given.action_map)))
 
-    def test_links_on_one_body_are_refused(self):
-        xml = """<mujoco><worldbody><body name="root"><geom name="root" size=".1"/>
-        <body name="a"><joint name="a" axis="0 1 0" actuatorfrcrange="-1 1"/>
-        <joint name="b" axis="0 1 0" actuatorfrcrange="-1 1"/><geom name="a" size=".1"/></body>
-        </body></worldbody></mujoco>"""
-        spec = characters.CharacterSpec(
-            name='two', joints={'a': characters.Joint(1, 1, 1), 'b': characters.Joint(1, 1, 1)},
-            fall_links=('root',), end_effectors=('a',), stumble_exempt=(), description='', xml=xml,
-            bodies=('root', 'a'),
-        )  # fmt: skip
-        with self.assertRaisesRegex(ValueError, 'flex needs one joint for each link'):
-            realism.body(actuation.Actuators(flex=0.1), spec)
-
 
 class CompositionTest(parameterized.TestCase):
-    """Each option, and all of them: single, batch, threads, save, restore, copy and pickle."""
-
-    def options(self, spec, name):
-        options = dict(ALL if name == 'all' else EACH[name])
-        if suite.find(spec).actuation == 'muscle':
-            options = {key: options[key] for key in options if key not in NOT_FOR_MUSCLES}
-        return options
-
-    @parameterized.product(spec=(PLANAR, SPATIAL), name=(*EACH, 'all'))
-    def test_bit_identity(self, spec, name):
-        self.compare(spec, self.options(spec, name), 10)
-
-    @parameterized.parameters('strength', 'noise', 'delay', 'all')
-    def test_bit_identity_with_muscles(self, name):
-        self.compare(MUSCLE, self.options(MUSCLE, name), 10)
-
-    def test_bit_identity_of_gaits(self):
-        options = {name: ALL[name] for name in ALL if name != 'torque_pose'}
-        self.compare(GAIT, options | {'delay': (0, 2)}, 3)
-
-    def test_bit_identity_of_hierarchies(self):
-        self.compare('PD_Biped3D_HLC_Soccer-v0', ALL, 2)
-
-    def compare(self, spec, options, steps):
-        kwargs = {'actuators': options}
-        seeds = [11, 12, 13, 14, 15, 16, 17, 18]
-        batches = [
-            VectorEnvironment(spec, 8, threads, seeds, task_kwargs=kwargs) for threads in (1, 3)
-        ]
-        single = suite.make(spec, task_kwargs={**kwargs, 'random': 15})
-        np.testing.assert_array_equal(batches[0].reset(), batches[1].reset())
-        single.reset()
-        size, saved = len(single.action_map), None
-        rng = np.random.default_rng(0)
-        for k in range(steps):
-            if k == steps // 2:
-                saved = pickle.loads(pickle.dumps(batches[0].get_state()))
-                restored = VectorEnvironment(spec, 8, 2, 99, task_kwargs=kwargs)
-                restored.reset()
-                restored.set_state(saved)
-                copied = pickle.loads(pickle.dumps(single))
-                clone = VectorEnvironment(spec, 1, 1, 5, task_kwargs=kwargs)
-                clone.reset()
-                clone.copy_from(batches[0], [4], [0])
-            action = rng.uniform(-1, 1, (8, size))
-            one, two = (batch.step(action) for batch in batches)
-            np.testing.assert_array_equal(one.observation, two.observation)
-            np.testing.assert_array_equal(one.reward, two.reward)
-            self.assertTrue(np.isfinite(one.observation).all())
-            if k == 0 or not one.terminated[4]:
-                np.testing.assert_array_equal(flat(single.step(action[4])), one.observation[4])
-            if saved is not None:
-                np.testing.assert_array_equal(restored.step(action).observation, one.observation)
-                if not one.terminated[4]:
-                    np.testing.assert_array_equal(flat(copied.step(action[4])), one.observation[4])
-                    found = clone.step(action[4:5]).observation[0]
-                    np.testing.assert_array_equal(found, one.observation[4])
-            if one.terminated[4]:
-                break
-        for batch in (*batches, restored, clone):
-            batch.close()
-
-    def test_gymnasium_shows_what_was_drawn(self):
-        import gymnasium
-
-        import trl_suite.gym  # noqa: F401
-
-        options = {'strength': (0.7, 1.3), 'delay': (10, 20)}
-        one = gymnasium.make(f'trl_suite/{PLANAR}', task_kwargs={'actuators': options})
-        _, info = one.reset(seed=1)
-        self.assertBetween(info['strength_right_hip'], 0.7, 1.3)
-        many = gymnasium.make_vec(
-            f'trl_suite/{PLANAR}', num_envs=4, task_kwargs={'actuators': options}
-        )
-        _, info = many.reset(seed=1)
-        self.assertEqual(info['delay'].shape, (4,))
-
-    def test_a_state_belongs_to_its_options(self):
-        one, two = make(delay=20), make(delay=30)
-        with self.assertRaisesRegex(ValueError, 'delay'):
-            two.set_state(one.get_state())
-
-    def test_a_plain_composer_environment_is_refused(self):
-        task = suite.make(PLANAR, task_kwargs={'actuators': {'noise': 0.1}}).task
-        environment = composer.Environment(copy.copy(task), random_state=0)
-        environment.reset()
-        with self.assertRaisesRegex(RuntimeError, 'not a plain composer.Environment'):
-            environment.step(np.zeros(len(task.action_map)))
-
-    def test_hooks_compose(self):
-        environment = make(noise=0.1)
-        environment.add_extra_hook('after_step', lambda physics, random_state: None)
-        self.assertTrue(np.isfinite(environment.step(actions(environment, 1)[0]).reward))
+    """With everything else; bit for bit: in state_test."""
 
     def test_custom_rewards_compose(self):
         environment = suite.make(
@@ -785,11 +627,6 @@ class DescriptionTest(absltest.TestCase):
         text = dict(describe.sections(spec, suite.make(MUSCLE)))['Options of actuators']
         self.assertNotIn('torque_speed', text)
         self.assertIn('strength', text)
-
-    def test_the_page_has_the_table_of_the_dataclass(self):
-        page = pathlib.Path(__file__).parents[1] / 'docs' / 'realism.md'
-        table = table_of(actuation.Actuators)
-        self.assertIn(tables.markdown_table(table), page.read_text('utf-8'))
 
 
 if __name__ == '__main__':
