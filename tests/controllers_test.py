@@ -1,13 +1,11 @@
 """Tests of the gait state machines: parameters, dynamics, laws and transitions, recomputed."""
 
-import json
-import pathlib
-
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import mjcf
 from dm_control.locomotion.arenas import floors
+from helpers import assert_refused
 
 from trl_suite import actuation, characters, controllers, terrain
 from trl_suite.arenas import PlanarArena
@@ -15,14 +13,8 @@ from trl_suite.controllers import dynamics, machine, parameters
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
 DT = 1 / 600
-FOLDER = pathlib.Path(parameters.__file__).parent
 NAMES = ('dog', 'goat', 'raptor', 'biped2d_simbicon', 'hopper')
 STRIDERS = ('raptor', 'biped2d_simbicon')
-# Parameters, those of an action, of no state, of each state; base actions; target speed.
-COUNTS = {
-    'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 7, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
-    'biped2d_simbicon': (33, 28, 5, 7, 10, 3.0), 'hopper': (9, 9, 1, 2, 18, 3.0),
-}  # fmt: skip
 # Of base action 0, and the largest deviation of any base action from the action_offset, by name.
 FIGURES = {
     'dog': {
@@ -64,12 +56,6 @@ BLENDS = {
     'biped2d_simbicon': {1: {'Contact.StanceHip': -1.051302}, 7: {'Up.SwingAnkle': 1.85618}},
     'hopper': {1: {'MagicGain': 0.8202}, 5: {'Ascent.Hip': 0.789777}, 7: {'Ascent.Knee': -0.536671}},
 }  # fmt: skip
-FIXED = {
-    'dog': ['TransTime'], 'goat': ['TransTime'], 'hopper': [],
-    'raptor': ['TransTime', 'ForceX', 'ForceY', 'Contact.SpineCurve', 'Down.SpineCurve',
-               'Passing.RootPitch', 'Passing.SpineCurve', 'Up.RootPitch', 'Up.SpineCurve'],
-    'biped2d_simbicon': ['TransTime', 'ForceX', 'ForceY', 'Passing.RootPitch', 'Up.RootPitch'],
-}  # fmt: skip
 ABSOLUTE = {
     'dog': ['TransTime', 'Cv'], 'goat': ['TransTime', 'Cv'], 'raptor': ['TransTime', 'Cv', 'Cd'],
     'biped2d_simbicon': ['TransTime', 'Cv', 'Cd'], 'hopper': ['MagicGain'],
@@ -87,31 +73,6 @@ SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
 
 class ParametersTest(parameterized.TestCase):
     """Parameter vectors, base actions, and the map from actions to parameters."""
-
-    def test_characters_with_a_gait(self):
-        self.assertCountEqual(controllers.available(), NAMES)
-        with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
-            controllers.load('dgo')
-        with self.assertRaisesRegex(ValueError, "unknown base_actions 'orginal'.*'original'"):
-            controllers.load('dog', 'orginal')
-
-    @parameterized.parameters(*COUNTS)
-    def test_counts(self, name):
-        gait = controllers.load(name)
-        count, actions, misc, per_state, base, speed = COUNTS[name]
-        self.assertLen(gait.names, count)
-        self.assertLen(gait.actions, actions)
-        self.assertEqual(gait.misc, misc)
-        self.assertEqual(count, misc + 4 * per_state)
-        self.assertEqual(gait.base_actions.shape, (base, count))
-        self.assertEqual(gait.target_speed, speed)
-        self.assertEqual(gait.states, STATES[name])
-        fixed = [n for i, n in enumerate(gait.names) if i not in gait.actions]
-        self.assertEqual(fixed, FIXED[name])
-        self.assertEqual([gait.names[i] for i in gait.absolute], ABSOLUTE[name])
-        for state, first in zip(gait.states, range(misc, count, per_state), strict=True):
-            for parameter in gait.names[first : first + per_state]:
-                self.assertStartsWith(parameter, f'{state}.')
 
     @parameterized.parameters(*FIGURES)
     def test_base_actions_of_the_original(self, name):
@@ -139,47 +100,6 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
     @parameterized.parameters(*NAMES)
-    def test_sets_that_were_tuned(self, name):
-        gait, original = controllers.load(name), controllers.load(name, 'original')
-        np.testing.assert_array_equal(gait.action_offset, original.action_offset)
-        tuned = set(json.loads((FOLDER / f'{name}.json').read_text()).get('tuning', {}))
-        for a, b, _ in original.blends:
-            self.assertNoCommonElements({a, b}, tuned)
-        if gait.blends == original.blends:
-            np.testing.assert_array_equal(gait.base_actions, original.base_actions)
-        else:  # action 0 is the first base action
-            np.testing.assert_array_equal(gait.base_actions[0], gait.action_offset)
-
-    def test_a_hopper_places_its_foot(self):
-        """The leg's angle before touch-down, with which the speed of a hopper is controlled.
-
-        M. Raibert, Legged robots that balance, 1986. The base actions of the original change it by
-        13 mrad only.
-        """
-        gait, original = (controllers.load('hopper', which) for which in ('default', 'original'))
-        place = gait.place('Descent.Hip')
-        self.assertLess(original.action_scale[place], 0.02)
-        self.assertGreater(gait.action_scale[place], 0.1)
-
-    def test_action_0_is_the_default_gait(self):
-        dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
-        np.testing.assert_array_equal(dog.action_offset, dog.base_actions[0])
-        np.testing.assert_array_equal(hopper.action_offset, hopper.base_actions[0])
-        np.testing.assert_array_equal(raptor.action_offset, raptor.base_actions[1])
-        biped = controllers.load('biped2d_simbicon')
-        for parameter, value in (
-            ('TransTime', 0.0825), ('Cv', 0.258612), ('Cd', 2.160335), ('Contact.RootPitch', -0.331847),
-            ('Down.StanceHip', 0.665958), ('Up.SwingAnkle', 0.182327),
-        ):  # fmt: skip
-            self.assertEqual(biped.action_offset[biped.place(parameter)], value)
-        goat = controllers.load('goat')
-        for parameter, value in (
-            ('TransTime', 0.125), ('Cv', 0.035053), ('BackForceX', 509.408108), ('FrontForceY', 363.495957),
-            ('Extend.Hip', 1.2993), ('Gather.Ankle', 1.794969),
-        ):  # fmt: skip
-            self.assertEqual(goat.action_offset[goat.place(parameter)], value)
-
-    @parameterized.parameters(*NAMES)
     def test_actions(self, name):
         gait = controllers.load(name)
         size, rng = len(gait.actions), np.random.default_rng(0)
@@ -199,7 +119,7 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_allclose(gait.action(vectors), actions, atol=1e-9)
         np.testing.assert_allclose(gait.action(vectors[2]), actions[2], atol=1e-9)
 
-    def test_invalid_files_are_rejected(self):
+    def test_files(self):
         good = {
             'character': 'hopper', 'kind': 'hop', 'legs': [['hip', 'leg']], 'feet': ['leg'],
             'targets': {'Hip': ['hip']}, 'misc': ['Gain'], 'states': ['Up', 'Down'],
@@ -213,7 +133,7 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_array_equal(gait.action_offset, [2, 4, 6])
         np.testing.assert_array_equal(gait.action_scale, [1, 2, 3])
         np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
-        for message, change in (
+        bad = (
             ("'Up.Hip' has no range.*in fixed", {'base_actions': [['b', 'b', 0]]}),
             ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),
             ("set 'a' needs 3", {'sets': {'a': [1, 2, float('nan')]}}),
@@ -223,9 +143,19 @@ class ParametersTest(parameterized.TestCase):
             ("unknown parameter of a state 'Hp'.*'Hip'", {'targets': {'Hp': ['hip']}}),
             ('same number of joints', {'legs': [['hip'], ['hip', 'leg']], 'feet': ['leg', 'leg']}),
             ('one foot for each', {'feet': []}),
-        ):
-            with self.assertRaisesRegex(ValueError, message):
-                parameters.read({**good, **change})
+        )
+        arena, biped = floors.Floor(), characters.make('biped2d')
+        arena.attach(biped)
+        assert_refused(
+            self,
+            *((lambda c=c: parameters.read({**good, **c}), message) for message, c in bad),
+            (lambda: controllers.load('dgo'), "unknown character with a gait 'dgo'.*'dog'"),
+            (
+                lambda: controllers.load('dog', 'orginal'),
+                "unknown base_actions 'orginal'.*'original'",
+            ),
+            (lambda: controllers.Gait(biped, 'world', arena.mjcf_model), "with a gait 'biped2d'"),
+        )
 
 
 class Rig:
@@ -486,18 +416,6 @@ class DynamicsTest(parameterized.TestCase):
             np.testing.assert_allclose(vector[1, :n], expected, rtol=0, atol=bound)
             np.testing.assert_array_equal(matrix[[0, 2]], others)
 
-    @parameterized.parameters(*NAMES)
-    def test_simulations_are_independent(self, name):
-        rig = Rig(name, 5, batch=True)
-        rig.scatter(4)
-        gait, feet = rig.gait, rig.gait.parameters.feet
-        rig.touches(feet)
-        gait.state.number[:] = rig.env_ids % 4
-        enter(rig)
-        together = gait.torques(rig.env_ids)
-        for env_ids in ([0], [1, 3], [2], [4]):
-            np.testing.assert_array_equal(gait.torques(np.array(env_ids)), together[env_ids])
-
 
 class LawTest(parameterized.TestCase):
     """Joint torques against the formulas."""
@@ -561,18 +479,6 @@ class LawTest(parameterized.TestCase):
                 expected = {'hip': value(f'{state}.Hip'), 'leg': value(f'{state}.Knee')}
             found = dict(zip(rig.joints, gait.state.target[0], strict=True))
             self.assertEqual(found, expected)
-
-    def test_targets_of_joints_without_a_state_target(self):
-        dog, raptor = Rig('dog'), Rig('raptor')
-        found = dict(zip(dog.joints, dog.gait.state.target[0], strict=True))
-        for joint, angle in (
-            ('neck0', 0.68507), ('head', 0.20456), ('tail0', 0.4), ('wrist', 0.11488),
-            ('finger', -0.46365), ('toe', -0.62549),
-        ):  # fmt: skip
-            self.assertEqual(found[joint], angle)
-        found = dict(zip(raptor.joints, raptor.gait.state.target[0], strict=True))
-        for joint, angle in (('spine0', 0.16682), ('tail4', 0.24638), ('right_toe', -0.3883)):
-            self.assertEqual(found[joint], angle)
 
     @parameterized.product(name=STRIDERS, stance=(0, 1), state=(0, 1, 2, 3), loaded=(True, False))
     def test_stride(self, name, stance, state, loaded):
@@ -774,20 +680,6 @@ class MachineTest(parameterized.TestCase):
         vector[...] = 0  # the caller's own
         np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[2:3])
 
-    def test_simulations_change_states_independently(self):
-        rig = Rig('dog', 4, batch=True)
-        gait = rig.gait
-        gait.state.number[:], gait.state.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
-        rig.touches(('toe',))
-        before = gait.state.target.copy()
-        ended = gait.advance(np.array([0, 1, 2]))
-        np.testing.assert_array_equal(ended, [False, False, True])
-        np.testing.assert_array_equal(gait.state.number, [1, 1, 3, 0])
-        self.assertEqual(gait.state.phase[3], 0.3)
-        np.testing.assert_array_equal(
-            (gait.state.target != before).any(1), [True, False, False, False]
-        )
-
     def test_hop(self):
         rig = Rig('hopper')
         gait = rig.gait
@@ -827,49 +719,6 @@ class MachineTest(parameterized.TestCase):
         gait.apply(rig.env_ids, gait.parameters.base_actions[3:4])
         self.assertEqual(gait.state.number[0], 0)
 
-    @parameterized.parameters(*NAMES)
-    def test_save_and_restore(self, name):
-        rig = Rig(name, 2, batch=True)
-        start(rig)
-        run(rig, 100)
-        saved = [array.copy() for array in rig.gait.state]
-        worlds = [rig.world.get_state(env_id) for env_id in rig.env_ids]
-        expected = run(rig, 300)
-        other = Rig(name, 2, batch=True)
-        start(other)
-        run(other, 37)
-        for array, values in zip(other.gait.state, saved, strict=True):
-            array[...] = values
-        for env_id, world in enumerate(worlds):
-            other.world.set_state(env_id, world)
-        np.testing.assert_array_equal(run(other, 300), expected)
-
-
-def start(rig):
-    """The pose of the first instant; the character stands on the ground."""
-    begin, q = rig.gait.parameters.start, np.zeros((rig.world.n, len(rig.rules.skeleton.dof)))
-    v = np.zeros_like(q)
-    q[:, 1:3], v[:, :3] = (begin['height'], begin['pitch']), begin['velocity']
-    q[:, 1] += 0.02
-    for name, (angle, rate) in begin['joints'].items():
-        dof = 3 + rig.gait.number[name]
-        q[:, dof], v[:, dof] = angle, rate
-    rig.put(q, v)
-    rig.gait.begin(rig.env_ids)
-
-
-def run(rig, steps):
-    """Default gait; returns all positions."""
-    gait, found = rig.gait, []
-    for _ in range(steps):
-        rig.world.ctrl[:] = gait.torques(rig.env_ids)
-        rig.world.step(2)
-        ended = np.flatnonzero(gait.advance(rig.env_ids))
-        if len(ended):
-            gait.apply(ended, np.tile(gait.parameters.action_offset, (len(ended), 1)))
-        found.append(rig.world.qpos.copy())
-    return np.array(found)
-
 
 class AloneTest(parameterized.TestCase):
     """A gait works without an environment of the suite."""
@@ -908,12 +757,6 @@ class AloneTest(parameterized.TestCase):
         self.assertLess(down, 60)  # of 1800
         self.assertGreater(world.qpos[0, places[0]], 6.0)
         self.assertLess(abs(world.qpos[0, places[2]]), 1.2)
-
-    def test_characters_without_a_gait_are_rejected(self):
-        arena, biped = floors.Floor(), characters.make('biped2d')
-        arena.attach(biped)
-        with self.assertRaisesRegex(ValueError, "unknown character with a gait 'biped2d'"):
-            controllers.Gait(biped, 'world', arena.mjcf_model)
 
 
 if __name__ == '__main__':
