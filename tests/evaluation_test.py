@@ -128,10 +128,6 @@ class EvaluateTest(parameterized.TestCase):
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
             self.assertEqual(evaluation.evaluate_all(cases, 3, 2, executor=pool), expected)
 
-    def test_the_random_baseline_repeats(self):
-        first = evaluation.evaluate(GAPS, evaluation.random, 5, 1, 1, factory=True)
-        self.assertEqual(evaluation.evaluate(GAPS, evaluation.random, 5, 1, 2, factory=True), first)
-
     def test_zero_actions_fall_early(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 10, factory=True)
         self.assertEqual((found['falls'], found['completion_rate'], found['diverged']), (1, 0, 0))

@@ -75,21 +75,6 @@ def disturbed(environment, rng, angle=0.4):
 class TaskTest(parameterized.TestCase):
     """The mirror of a task against the reflection of its state."""
 
-    @parameterized.parameters(*CASES)
-    def test_reflecting_twice_is_the_identity(self, *case):
-        environment, _ = build(case)
-        mirror = environment.task.mirror
-        mirror.check(environment.observation_spec()['observations'].shape[0],
-                     len(environment.action_map))  # fmt: skip
-        rng = np.random.default_rng(0)
-        observation = rng.normal(size=(40, len(mirror.observation_index)))
-        observation[:, mirror.phase] = rng.integers(0, 30, 40) / 30
-        action = rng.normal(size=(40, len(mirror.action_index)))
-        again = mirror.observation(mirror.observation(observation))
-        np.testing.assert_allclose(again, observation, rtol=0, atol=1e-15)
-        np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
-        self.assertFalse(np.array_equal(mirror.observation(observation), observation))
-
     @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.0, 0.13, 0.4)))
     def test_half_a_cycle_later_all_is_reflected(self, case, phase):
         # Clips are symmetric, and so is ground of which the middle line is a line of symmetry.
@@ -186,11 +171,6 @@ class TaskTest(parameterized.TestCase):
                 np.testing.assert_array_equal(expected[[0, 1, 2, 9, 10, 11]], 0)
                 expected = np.concatenate([expected[12:], expected[3:6], expected[6:9]])
             np.testing.assert_array_equal(seen[part], expected, err_msg=name)
-
-    def test_sizes(self):
-        for case, plain, mirrored in ((STEP, 125, 117), (WALK, 112, 110)):
-            self.assertLen(build(case)[1], plain)
-            self.assertLen(build(case, mirrored=True)[1], mirrored)
 
     def test_each_simulation_is_reflected_by_its_own_phase(self):
         plain = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0)
@@ -292,21 +272,6 @@ class PlanTest(parameterized.TestCase):
 
     def test_tasks_that_also_control_joints_have_no_mirror(self):
         self.assertIsNone(suite.make(SOCCER, {'interface': 'frame'}).task.mirror)
-
-    def test_saved_and_loaded(self):
-        mirror = suite.make(SOCCER).task.mirror
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        path = pathlib.Path(folder.name) / 'p.npz'
-        policy = policy_for(self.soccer(0.0))
-        policies.save(policy, path)
-        again = policies.load(path)
-        for field in dataclasses.fields(Mirror):
-            np.testing.assert_array_equal(
-                getattr(again.mirror, field.name), getattr(mirror, field.name)
-            )
-        observation = np.random.default_rng(0).normal(size=(5, 116))
-        np.testing.assert_array_equal(again(observation), policy(observation))
 
 
 class MirrorTest(parameterized.TestCase):
