@@ -101,22 +101,6 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(mapping.action_scale, action_scale)
         np.testing.assert_array_equal(mapping.action_offset, 0)
 
-    def test_torque_is_three_quarters_of_the_limit(self):
-        mapping = Mounted('biped2d_full', 'torque').map
-        full = dict(zip(mapping.names, mapping.control(np.ones(11)), strict=True))
-        # Limits 150, 125, 100 at hip, knee, ankle; 100, 75 at shoulder, elbow; 50 at the neck.
-        for joint, torque in (
-            ('right_hip', 112.5), ('left_knee', 93.75), ('right_ankle', 75), ('left_shoulder', 75),
-            ('right_forearm', 56.25), ('neck', 37.5),
-        ):  # fmt: skip
-            self.assertAlmostEqual(full[joint], torque)
-        np.testing.assert_array_equal(mapping.action_offset, 0)
-
-    def test_excitation_is_between_a_hundredth_and_one(self):
-        mapping = Mounted('dog', 'muscle').map
-        np.testing.assert_allclose(mapping.control(-np.ones(44)), 0.01)
-        np.testing.assert_allclose(mapping.control(np.ones(44)), 1)
-
     def test_position_options(self):
         reach = np.linspace(0.5, 1.5, 6)
         mapping = Mounted('biped2d', 'position', action_offset=[0.1] * 6, action_scale=reach).map

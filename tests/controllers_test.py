@@ -99,26 +99,6 @@ class ParametersTest(parameterized.TestCase):
         found = gait.vector(np.clip(actions, -1, 1))
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
-    @parameterized.parameters(*NAMES)
-    def test_actions(self, name):
-        gait = controllers.load(name)
-        size, rng = len(gait.actions), np.random.default_rng(0)
-        np.testing.assert_array_equal(gait.vector(np.zeros((2, size))), [gait.action_offset] * 2)
-        for sign in (1, -1):
-            (vector,) = gait.vector(np.full((1, size), sign))
-            expected = gait.action_offset + sign * gait.action_scale
-            np.testing.assert_allclose(vector, expected, rtol=0, atol=1e-12)
-            idle = np.delete(np.arange(len(vector)), gait.actions)
-            np.testing.assert_array_equal(vector[idle], gait.action_offset[idle])
-        one = np.zeros((1, size))
-        one[0, 3] = 1.0
-        changed = np.flatnonzero(gait.vector(one)[0] != gait.action_offset)
-        np.testing.assert_array_equal(changed, gait.actions[3:4])
-        actions = rng.uniform(-1, 1, (4, size))
-        vectors = gait.vector(actions)
-        np.testing.assert_allclose(gait.action(vectors), actions, atol=1e-9)
-        np.testing.assert_allclose(gait.action(vectors[2]), actions[2], atol=1e-9)
-
     def test_files(self):
         good = {
             'character': 'hopper', 'kind': 'hop', 'legs': [['hip', 'leg']], 'feet': ['leg'],

@@ -20,7 +20,6 @@ from helpers import (
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
-from trl_suite.tasks import terms
 from trl_suite.tasks.common.plans import Plans, Pushes, StraightPlans
 from trl_suite.vector import VectorEnvironment
 
@@ -180,12 +179,6 @@ class ClockTest(parameterized.TestCase):
             suite.build('biped2d_full', task='footsteps', clip=mirrored)
         again = suite.build('biped2d_full', task='footsteps', clip=mirrored.mirrored())
         self.assertTrue(again.reset().first())
-
-    @parameterized.parameters((GENERAL, 22), (RUN, 22), (FULL, 45))
-    def test_actions_of_the_original(self, id_, size):
-        environment, _ = started(id_, action_offset='original')
-        self.assertEqual(environment.action_spec().shape, (size,))
-        self.assertTrue(environment.step(np.zeros(size)).mid())
 
 
 class PlanTest(parameterized.TestCase):
@@ -430,11 +423,6 @@ class RewardTest(parameterized.TestCase):
             self.assertAlmostEqual(term.weight, WEIGHTS[term.name], delta=1e-12)
             self.assertEqual(term.scale, SCALES.get(term.name))
         self.assertAlmostEqual(sum(term.weight for term in task.terms), 1, delta=1e-12)
-
-    def test_factor_of_the_heading_error(self):
-        angles = (0.0, np.pi / 2, np.pi, -np.pi / 2, np.pi / 3, 2 * np.pi)
-        found = [terms.facing(angle) for angle in angles]
-        np.testing.assert_allclose(found, [1, 1 / 16, 0, 1 / 16, 0.75**4, 1], atol=1e-12)
 
     def placed(self, id_, phase, **options):
         """The body exactly where its reference is, the plan on its step; where that lands, (3,) m."""

@@ -478,18 +478,6 @@ class CycleTest(parameterized.TestCase):
             for vectors in (seen[0], seen[-1]):
                 np.testing.assert_array_equal(vectors, expected)
 
-    def test_action_map(self):
-        for id_ in EXAMPLES:
-            environment = make(id_)
-            figures, action_map = environment.task.gait.parameters, environment.action_map
-            np.testing.assert_array_equal(
-                action_map.action_offset, figures.action_offset[figures.actions]
-            )
-            np.testing.assert_array_equal(
-                action_map.action_scale, figures.action_scale[figures.actions]
-            )
-            self.assertEqual(action_map.names, tuple(figures.names[i] for i in figures.actions))
-
 
 class BaseActionTest(parameterized.TestCase):
     """The discrete interface: a preference per base action, at 30 Hz."""

@@ -141,12 +141,6 @@ class ClockTest(parameterized.TestCase):
 class PlanTest(parameterized.TestCase):
     """The map from actions to plans."""
 
-    def test_native_mapping(self):
-        action_map = started()[0].action_map
-        np.testing.assert_allclose(action_map.control(np.zeros(5)), [0.5, 0, 1, 0, 0])
-        np.testing.assert_allclose(action_map.control(np.ones(5)), [1.5, 1, 3, 2, np.pi])
-        np.testing.assert_allclose(action_map.control(-np.ones(5)), [-0.5, -1, -1, -2, -np.pi])
-
     @parameterized.parameters(FOREST, MOVERS, SOCCER, TRAIL)
     def test_plan_is_relative_to_the_start_of_the_step_and_fixed(self, id_):
         environment, _ = started(id_)
