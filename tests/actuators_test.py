@@ -205,24 +205,6 @@ class TorqueSpeedTest(parameterized.TestCase):
                     )
         self.assertGreater(saturated, 50)
 
-    def test_torque_equals_that_of_mujocos_dc_motor(self):
-        # A DC motor at full voltage V: torque K / R (V - K v) = limit (1 - v / no_load).
-        limit, no_load = 12.0, 8.0
-        xml = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/>
-        </body></worldbody><actuator><dcmotor name="m" joint="j" motorconst="{k}" resistance="{r}"/>
-        </actuator></mujoco>"""
-        constant = 1.5
-        voltage = constant * no_load
-        resistance = constant * voltage / limit
-        model = mujoco.MjModel.from_xml_string(xml.format(k=constant, r=resistance))
-        data = mujoco.MjData(model)
-        data.ctrl[0] = voltage
-        for v in np.linspace(0, no_load, 9):
-            data.qvel[0] = v
-            mujoco.mj_forward(model, data)
-            expected = limit * motors.speed_factor(v, no_load, 1.5)
-            self.assertAlmostEqual(data.actuator_force[0], expected, places=9)
-
     def test_norm_of_ball_joints_follows_the_formula(self):
         # The intended torque is that of the same state without limits.
         for model in ('position', 'torque'):

@@ -291,11 +291,6 @@ class FallTest(parameterized.TestCase):
             self.assertTrue(environment.step(AHEAD).first())
             self.assertFalse(environment.info['fell'])
 
-    def test_contact_of_the_feet_is_not_a_fall(self):
-        environment, _ = started(PLANE)
-        for _ in range(10):
-            self.assertTrue(environment.step(AHEAD).mid())
-
 
 class GoalTest(parameterized.TestCase):
     """Where to go."""

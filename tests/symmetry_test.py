@@ -11,7 +11,7 @@ from helpers import made
 from trl_suite import policies, suite
 from trl_suite.bodies.reference import joint_targets
 from trl_suite.policies import files
-from trl_suite.policies.mirror import Mirror, blocks, exchanged
+from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 
@@ -304,12 +304,6 @@ class MirrorTest(parameterized.TestCase):
         observation = np.array([[1.0, 2, 3, 0.25], [1.0, 3, 2, 0.25], [1.0, 2, 2, 0.25]])
         np.testing.assert_array_equal(mirror.left(observation), [True, False, False])
         np.testing.assert_array_equal(mirror.observation(observation[:1]), [[1, -3, -2, 0.25]])
-
-    def test_blocks(self):
-        np.testing.assert_array_equal(exchanged(4, [(1, 3)]), [0, 3, 2, 1])
-        index, sign = blocks(np.array([1, 0]), (1.0, -1.0, 1.0))
-        np.testing.assert_array_equal(index, [3, 4, 5, 0, 1, 2])
-        np.testing.assert_array_equal(sign, [1, -1, 1, 1, -1, 1])
 
     @parameterized.parameters(
         ({'observation_index': np.array([0, 1, 1, 3])}, 'mirror_observation_index'),
