@@ -1,26 +1,30 @@
-"""Tests of the imitation task: observation, reward and reset, recomputed independently."""
+"""Tests of the imitation tasks, in the plane and in 3D: observation, reward, start, recomputed."""
 
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import made
+from helpers import assert_refused, assert_uniform, flattened, ground, made, put
 
-from trl_suite import characters, motion, suite, terrain
-from trl_suite.arenas import PlanarArena
-from trl_suite.environments.environment import Environment
+from trl_suite import motion, suite, terrain
 from trl_suite.tasks import terms
-from trl_suite.tasks.common import rewards
-from trl_suite.tasks.imitation.task import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
 DOG, RAPTOR = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Raptor2D_Slopes_Terrain-v0'
 BIPED, MUSCLES = 'PD_Biped2D_Gaps_Terrain-v0', 'MTU_Dog2D_LLC_Imitate_Flat-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'planar_imitation']
-EXAMPLES = (
+FLAT, SLOPES = 'PD_Biped2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Slopes_Terrain-v0'
+PLANE, HILLS, STEPS, TRACK, RUN, STAIRS = (
+    f'PD_Biped3D_Imitate{ground}-v0'
+    for ground in ('', '-Hills', '-Steps', '-Track', '-Run', '-Stairs')
+)
+PLANAR_IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'planar_imitation']
+SPATIAL_IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'spatial_imitation']
+PLANAR = (
     DOG, RAPTOR, BIPED, MUSCLES, 'Torque_Raptor2D_LLC_Imitate_Flat-v0', 'PD_Biped2D_Incline-v0',
     'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
 )  # fmt: skip
+SPATIAL = (PLANE, HILLS, STEPS, RUN, STAIRS)
+EXAMPLES = (*PLANAR, *SPATIAL)
 WEIGHTS = {'pose': 0.5, 'velocity': 0.05, 'end_effector': 0.15, 'com': 0.2, 'root': 0.1}
 SCALES = {'pose': 2, 'velocity': 0.005, 'end_effector': 40, 'com': 10, 'root': 10}
 # Raw reward weights: root, then joints in link order.
@@ -29,11 +33,14 @@ RAW = {
     'raptor': [1] + [0.5] * 5 + [0.25] * 5 + 2 * [1, 0.5, 0.5, 0.5],
     'biped2d': [1] + 2 * [0.3, 0.3, 0.2],
     'biped2d_full': [1] + 2 * [0.3, 0.3, 0.2] + [0.3] * 5,
+    'biped3d': [1, 0.5] + 2 * [0.5, 0.3, 0.2],
 }
-EFFECTORS = {
-    'dog': ('finger', 'toe'), 'raptor': ('right_toe', 'left_toe'),
-    'biped2d': ('right_ankle', 'left_ankle'), 'biped2d_full': ('right_ankle', 'left_ankle'),
-}  # fmt: skip
+EFFECTORS = {'dog': ('finger', 'toe'), 'raptor': ('right_toe', 'left_toe')}
+ANKLES = ('right_ankle', 'left_ankle')
+
+
+def wrapped(angle):
+    return np.angle(np.exp(1j * angle))
 
 
 class Probe:
@@ -41,98 +48,171 @@ class Probe:
 
     def __init__(self, environment):
         self.environment, self.task = environment, environment.task
-        self.name = self.task.character.spec.name
-        self.links = self.task.character.spec.links
+        self.spec = self.task.character.spec
+        self.name, self.links = self.spec.name, self.spec.links
         self.named = environment.physics.named
-        self.strip = terrain.PlanarGround.from_state(self.task.arena.grounds[0].state())
-        first, count = -400, 2400
-        heights, _ = self.strip.window(first, count)
-        self.ground = lambda x: np.interp(x, (first + np.arange(count)) * 0.025, heights)
 
-    def qpos(self, joint):
-        return float(self.named.data.qpos[f'{self.name}/{joint}'][0])
+    def body(self, field, link):
+        return getattr(self.named.data, field)[f'{self.name}/{link}']
 
-    def qvel(self, joint):
-        return float(self.named.data.qvel[f'{self.name}/{joint}'][0])
-
-    @property
-    def root(self):
-        return np.array([self.qpos('root_x/'), self.qpos('root_z/')])
-
-    @property
-    def facing(self):
-        return -1.0 if np.cos(self.qpos('root_pitch/')) < 0 else 1.0
+    def joint(self, name, field='qpos'):
+        return getattr(self.named.data, field)[f'{self.name}/{name}']
 
     def velocity(self, link):
-        """Velocity of a link's centre of mass, world axes, x and z."""
+        """Angular velocity of a link and velocity of its centre of mass, world axes."""
         model, data = self.environment.physics.model.ptr, self.environment.physics.data.ptr
         result = np.zeros(6)
         body = model.body(f'{self.name}/{link}').id
+        # Of the body's inertial frame, in world axes.
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, result, 0)
-        return result[[3, 5]]  # of the body's inertial frame, axes of the world
-
-    def blocks(self):
-        x, z = self.root
-        heading = np.array([self.facing, 1.0])
-        under = self.ground(x)
-        samples = x + self.facing * np.linspace(-0.5, 3, 50)
-        centres = [self.named.data.xipos[f'{self.name}/{n}'][[0, 2]] for n in self.links]
-        return {
-            'terrain': self.ground(samples) - under,
-            'pose': np.concatenate([[z - under], *((c - self.root) * heading for c in centres)]),
-            'velocity': np.concatenate([self.velocity(n) * heading for n in self.links]),
-        }
+        return result[:3], result[3:]
 
     def centre_of_mass(self):
         """Position and velocity of the whole body's centre of mass."""
         mass = np.array([self.named.model.body_mass[f'{self.name}/{n}'] for n in self.links])
-        centres = [self.named.data.xipos[f'{self.name}/{n}'][[0, 2]] for n in self.links]
-        velocities = [self.velocity(n) for n in self.links]
+        centres = [self.body('xipos', n) for n in self.links]
+        velocities = [self.velocity(n)[1] for n in self.links]
         return mass @ centres / mass.sum(), mass @ velocities / mass.sum()
 
-    def reward_features(self):
-        joints = self.links[1:]
-        com, velocity = self.centre_of_mass()
-        x, z = self.root
-        effectors = []
-        for link in EFFECTORS[self.name]:
-            place = self.named.data.xpos[f'{self.name}/{link}']
-            effectors.append((place[0] - com[0], place[2] - self.ground(place[0])))
+    def terms(self, wanted):
+        """Expected reward terms, for the probe of the reference."""
+        found, wanted = self.features(), wanted.features()
+        weights = np.array(RAW[self.name]) / np.sum(RAW[self.name])
+        turned = [self.angle(*pair) for pair in zip(found['pose'], wanted['pose'], strict=True)]
+        rates = [np.sum((a - b) ** 2) for a, b in zip(found['rates'], wanted['rates'], strict=True)]
+        errors = {
+            'pose': weights @ np.square(turned),
+            'velocity': weights @ rates,
+            'end_effector': np.mean(np.sum((found['feet'] - wanted['feet']) ** 2, axis=1)),
+            'com': 0.1 * np.sum((found['com_velocity'] - wanted['com_velocity']) ** 2),
+            'root': (found['height'] - wanted['height']) ** 2,
+        }
+        return {name: WEIGHTS[name] * np.exp(-SCALES[name] * e) for name, e in errors.items()}
+
+
+class PlanarProbe(Probe):
+    def __init__(self, environment):
+        super().__init__(environment)
+        strip = terrain.PlanarGround.from_state(self.task.arena.grounds[0].state())
+        first, count = -400, 2400
+        heights, _ = strip.window(first, count)
+        self.ground = lambda x, y=0: np.interp(x, (first + np.arange(count)) * 0.025, heights)
+
+    @property
+    def root(self):
+        return np.array([self.joint('root_x/')[0], 0, self.joint('root_z/')[0]])
+
+    def blocks(self):
+        x, _, z = self.root
+        facing = -1.0 if np.cos(self.joint('root_pitch/')[0]) < 0 else 1.0
+        heading = np.array([facing, 1.0])
+        under = self.ground(x)
+        samples = x + facing * np.linspace(-0.5, 3, 50)
+        centres = [(self.body('xipos', n) - self.root)[[0, 2]] * heading for n in self.links]
+        velocities = [self.velocity(n)[1][[0, 2]] * heading for n in self.links]
         return {
-            'angles': np.array([self.qpos('root_pitch/'), *map(self.qpos, joints)]),
-            'rates': np.array([self.qvel('root_pitch/'), *map(self.qvel, joints)]),
-            'effectors': np.array(effectors),
-            'com_velocity': velocity,
-            'height': z - self.ground(x),
+            'terrain': self.ground(samples) - under,
+            'pose': np.concatenate([[z - under], *centres]),
+            'velocity': np.concatenate(velocities),
+        }
+
+    def angle(self, found, wanted):
+        return wrapped(found - wanted)
+
+    def features(self):
+        com, velocity = self.centre_of_mass()
+        names, feet = ['root_pitch/', *self.links[1:]], []
+        for link in EFFECTORS.get(self.name, ANKLES):
+            place = self.body('xpos', link)
+            feet.append((place[0] - com[0], place[2] - self.ground(place[0])))
+        return {
+            'pose': [float(self.joint(n)[0]) for n in names],
+            'rates': [float(self.joint(n, 'qvel')[0]) for n in names],
+            'feet': np.array(feet),
+            'com_velocity': velocity[[0, 2]],
+            'height': self.root[2] - self.ground(self.root[0]),
         }
 
 
-class Reference:
-    """The clip on the same character, by forward kinematics on flat ground."""
+class SpatialProbe(Probe):
+    def ground(self, x, y=0):
+        return ground(self.environment, x, y)
 
-    def __init__(self, environment):
-        task = environment.task
-        config = PlanarImitationConfig(reference_observation=task.actuation_model == 'muscle')
-        self.clip = task.clip
-        spec = task.character.spec
-        other = PlanarImitation(
-            characters.make(spec.name), PlanarArena(terrain.load('flat')), self.clip,
-            config, actuation_model=task.actuation_model,
-        )  # fmt: skip
-        self.environment = Environment(other, random=0)
-        self.environment.reset()
-        self.probe = Probe(self.environment)
+    @property
+    def root(self):
+        return self.body('xpos', 'root')
 
-    def at(self, phase):
-        time = phase * self.clip.duration
-        pose, rate = self.clip.pose(time), self.clip.velocity(time)
-        data, name = self.probe.named.data, self.probe.name
-        names = ['root_x/', 'root_z/', 'root_pitch/', *self.probe.links[1:]]
-        for i, joint in enumerate(names):
-            data.qpos[f'{name}/{joint}'] = 0 if i == 0 else pose[i]
-            data.qvel[f'{name}/{joint}'] = rate[i]
-        self.environment.physics.forward()
-        return self.probe
+    @property
+    def heading(self):
+        ahead = self.body('xmat', 'root').reshape(3, 3)[:, 0]
+        return np.arctan2(ahead[1], ahead[0])
+
+    def blocks(self):
+        turn, root = flattened(self.heading), self.root
+        under = float(self.ground(root[0], root[1]))
+        pose, velocity = [root[2:] - under], []
+        for link in self.links:
+            pose.append(turn @ (self.body('xipos', link) - root))
+            matrix = turn @ self.body('xmat', link).reshape(3, 3)
+            wxyz = np.zeros(4)
+            mujoco.mju_mat2Quat(wxyz, matrix.ravel())
+            pose.append(wxyz * np.where(wxyz[0] < 0, -1, 1))
+            spin, linear = self.velocity(link)
+            velocity += [turn @ linear, turn @ spin]
+        ahead = np.tile(np.linspace(-1, 10, 32), 32)
+        aside = np.repeat(np.linspace(5.5, -5.5, 32), 32)  # from the left to the right
+        points = root[:2, None] + turn.T[:2, :2] @ [ahead, aside]
+        return {
+            'terrain': self.ground(*points) - under,
+            'pose': np.concatenate(pose),
+            'velocity': np.concatenate(velocity),
+        }
+
+    def angle(self, found, wanted):
+        if np.ndim(found) == 0:
+            return found - wanted
+        return np.arccos(np.clip((np.trace(found @ wanted.T) - 1) / 2, -1, 1))
+
+    def features(self):
+        turn, root = flattened(self.heading), self.root
+        com, com_velocity = self.centre_of_mass()
+        rotations = [turn @ self.body('xmat', 'root').reshape(3, 3)]
+        rates = [turn @ self.velocity('root')[0]]
+        for joint, ball in zip(self.spec.joints, self.task.character.spherical, strict=True):
+            qpos, matrix = self.joint(joint), np.zeros(9)
+            rates.append(self.joint(joint, 'qvel').copy())
+            if ball:
+                mujoco.mju_quat2Mat(matrix, qpos)
+            rotations.append(matrix.reshape(3, 3) if ball else float(qpos[0]))
+        feet = []
+        for link in ANKLES:
+            place = self.body('xpos', link)
+            foot = turn @ (place - com)
+            foot[2] = place[2] - self.ground(place[0], place[1])
+            feet.append(foot)
+        return {
+            'pose': rotations, 'rates': rates, 'feet': np.array(feet), 'com_velocity': com_velocity,
+            'height': root[2] - float(self.ground(root[0], root[1])),
+        }  # fmt: skip
+
+
+def probe(environment):
+    spatial = environment.task.character.spec.spatial
+    return (SpatialProbe if spatial else PlanarProbe)(environment)
+
+
+def reference(environment):
+    """A probe of the same character in the pose of the clip, by forward kinematics on level ground."""
+    task, clip = environment.task, environment.task.clip
+    spec = task.character.spec
+    level = 'plane' if spec.spatial else 'flat'
+    other = made(spec.name, 'position', level, 'imitation', clip.name)
+    other.reset()
+    time = float(task.phase[0]) * clip.duration
+    pose = clip.pose(time)
+    pose[: 2 if spec.spatial else 1] = 0
+    put(other, pose, clip.velocity(time))
+    return probe(other)
 
 
 def started(id_, steps=0, **options):
@@ -146,17 +226,25 @@ def started(id_, steps=0, **options):
     return environment, step
 
 
+def observed_terms(environment):
+    """Reward terms of the present state, which a start has as well."""
+    environment.task.observe()
+    return environment.info['reward_terms']
+
+
 class ObservationTest(parameterized.TestCase):
     """Every block against named access and the engine's own velocities."""
 
-    @parameterized.parameters(*((id_, steps) for id_ in EXAMPLES for steps in (0, 5, 23)))
+    @parameterized.product(id_=EXAMPLES, steps=(0, 5, 14))
     def test_terrain_pose_and_velocity(self, id_, steps):
-        environment, step = started(id_, steps)
-        expected = Probe(environment).blocks()
-        for name in ('terrain', 'pose', 'velocity'):
+        options = {'terrain_observation': 'height'} if id_ in SPATIAL else {}
+        environment, step = started(id_, steps, **options)
+        for name, expected in probe(environment).blocks().items():
             if name in step.observation:
+                # Height grids are stored in single precision.
+                near = 1e-6 if id_ in SPATIAL and (name == 'terrain' or id_ == HILLS) else 1e-9
                 np.testing.assert_allclose(
-                    step.observation[name], expected[name], atol=1e-9, err_msg=name
+                    step.observation[name], expected, rtol=0, atol=near, err_msg=name
                 )
 
     @parameterized.parameters(DOG, RAPTOR, BIPED)
@@ -170,231 +258,270 @@ class ObservationTest(parameterized.TestCase):
             data.qvel[:] *= 0.1
             environment.physics.forward()
             step = environment.step(np.zeros(len(environment.action_map)))
-            expected = Probe(environment).blocks()
-            for block, value in expected.items():
+            for block, value in probe(environment).blocks().items():
                 np.testing.assert_allclose(step.observation[block], value, atol=1e-9)
 
-    @parameterized.parameters(DOG, RAPTOR, BIPED)
+    @parameterized.parameters(0.0, 1.0, 3.0, -2.5)
+    def test_observation_does_not_depend_on_the_heading(self, heading):
+        # On a plane pose and velocity stay the same when everything is turned and moved.
+        environment, step = started(PLANE, 5)
+        task, data, before = environment.task, environment.physics.data, step.observation
+        pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+        turned, half = np.zeros(4), heading / 2
+        mujoco.mju_mulQuat(turned, np.array([np.cos(half), 0, 0, np.sin(half)]), pose[3:7])
+        pose[:2], pose[3:7] = (3.0, -2.0), turned
+        rate[:3] = flattened(heading).T @ rate[:3]  # the angular one is in the root's own axes
+        put(environment, pose, rate)
+        task.observe()
+        for name in ('pose', 'velocity'):
+            np.testing.assert_allclose(environment.observation()[name], before[name], atol=1e-9)
+
+    @parameterized.parameters(DOG, RAPTOR, BIPED, PLANE, RUN)
     def test_phase(self, id_):
         environment, step = started(id_, start_phase=0.2)
-        period = environment.task.clip.duration
-        phase = 0.2
+        period, phase = environment.task.clip.duration, 0.2
         for _ in range(60):
             block = step.observation['phase']
-            self.assertLess(abs((block[0] - phase + 0.5) % 1 - 0.5), 1e-9)
+            self.assertLess(abs((block[0] - phase + 0.5) % 1 - 0.5), 1e-8)
             self.assertTrue(0 <= block[0] < 1)
             np.testing.assert_array_equal(block[1:], np.eye(4)[int(4 * block[0])])
             step = environment.step(np.zeros(len(environment.action_map)))
             phase = 0.2 if step.first() else phase + 1 / 30 / period
 
-    @parameterized.parameters(*(id_ for id_ in IDS if 'LLC' in id_))
-    def test_target(self, id_):
-        environment, step = started(id_, 4)
-        probe = Reference(environment).at(float(environment.task.phase[0]))
-        expected = probe.blocks()
-        links = len(probe.links)
-        target = step.observation['reference']
-        np.testing.assert_allclose(target[: 2 * links + 1], expected['pose'], atol=1e-4)
-        scale = np.abs(expected['velocity']).max()
-        np.testing.assert_allclose(
-            target[2 * links + 1 :], expected['velocity'], atol=2e-3 * max(scale, 1)
-        )
+    @parameterized.parameters(*((id_, steps) for id_ in (*PLANAR_IDS, TRACK) if 'LLC' in id_ or id_ == TRACK
+                                for steps in ((0, 4) if id_ in (TRACK, FLAT) else (4,))))  # fmt: skip
+    def test_target(self, id_, steps):
+        environment, step = started(id_, steps)
+        expected, target = reference(environment).blocks(), step.observation['reference']
+        pose, velocity = expected['pose'], expected['velocity']
+        if id_ == TRACK:  # of each link, where it is and how it moves, not how it is turned
+            pose = np.append(pose[0], pose[1:].reshape(8, 7)[:, :3])
+            velocity = velocity.reshape(8, 6)[:, :3].ravel()
+        # The task interpolates a table of the clip, best where velocities are its slope.
+        np.testing.assert_allclose(target[: len(pose)], pose, atol=1e-4)
+        near = 2e-3 * max(np.abs(velocity).max(), 1) if id_ != TRACK else 5e-3
+        np.testing.assert_allclose(target[len(pose) :], velocity, atol=near)
 
-    def test_target_is_observed_after_reset(self):
-        environment, step = started('PD_Biped2D_LLC_Imitate_Flat-v0')
-        probe = Reference(environment).at(float(environment.task.phase[0]))
-        np.testing.assert_allclose(
-            step.observation['reference'][:15], probe.blocks()['pose'], atol=1e-4
-        )
+    @parameterized.parameters(
+        (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (-2.0, 1.0, 0.0), (4.0, -3.0, 0.5), (0.5, 2.0, -3.0),
+    )  # fmt: skip
+    def test_goal_is_straight_ahead(self, x, y, heading):
+        environment, _ = started(PLANE)
+        task, data = environment.task, environment.physics.data
+        pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+        pose[:2] = x, y
+        pose[3:7] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+        put(environment, pose, rate)
+        task.observe()
+        bearing, distance = environment.observation()['goal']
+        # The point (x + 3, 0) on the line through the start along +x.
+        expected = np.arctan2(-y, 3) - heading
+        self.assertAlmostEqual(np.cos(bearing - expected), 1, delta=1e-12)
+        self.assertTrue(-np.pi <= bearing <= np.pi)
+        self.assertAlmostEqual(distance, np.hypot(3, y), delta=1e-12)
 
-    def test_observation_sizes_of_the_documentation(self):
-        blocks = suite.make('PD_Biped2D_Gaps_Terrain-v0').blocks
-        self.assertEqual(blocks['terrain'], slice(0, 50))
-        self.assertEqual(blocks['pose'], slice(50, 75))  # height, then 12 pairs
-        self.assertEqual(blocks['velocity'], slice(75, 99))
-        self.assertEqual(blocks['phase'], slice(99, 104))
-        blocks = suite.make('Torque_Raptor2D_LLC_Imitate_Flat-v0').blocks
-        self.assertEqual(blocks['pose'], slice(0, 39))
-        self.assertEqual(blocks['velocity'], slice(39, 77))
-        self.assertEqual(blocks['reference'], slice(77, 154))
+    @parameterized.parameters(('biped3d', 17, 22), ('biped3d_full_mocap', 35, 45))
+    def test_actions_of_the_original(self, character, size, original):
+        for options, expected in (({}, size), ({'action_offset': 'original'}, original)):
+            spec = suite.build(character, task_kwargs=options).action_spec()
+            self.assertEqual(spec.shape, (expected,))
 
-
-def observed_terms(environment):
-    """Reward terms of the present state, which a start has as well."""
-    environment.task.observe()
-    return environment.info['reward_terms']
+    def test_velocity_against_a_belt(self):
+        """Observed velocities are relative to the belt on which a character stands."""
+        for task_name in ('imitation', 'footsteps'):
+            environment = suite.build(
+                'biped3d_mocap', terrain='conveyor3d_wide', task=task_name,
+                task_kwargs={'random': 2, 'start_phase': 0.1},
+            )  # fmt: skip
+            beside = environment.reset().observation
+            task, data = environment.task, environment.physics.data
+            belt = task.arena.grounds[0].layout.belts.velocity[0]
+            self.assertAlmostEqual(np.linalg.norm(belt), 0.6)
+            pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+            pose[:3] += 5.5 - pose[0], -pose[1], 0.01  # the strip from x = 3 to 8 m, 1 cm high
+            put(environment, pose, rate)
+            task.arena.recentre(np.zeros(1, int), pose[None, :2])
+            task.observe()
+            upon, expected = environment.observation(), beside['velocity'].reshape(8, 6).copy()
+            expected[:, :2] -= flattened(probe(environment).heading)[:2, :2] @ belt
+            np.testing.assert_allclose(upon['velocity'].reshape(8, 6), expected, atol=1e-9)
+            np.testing.assert_allclose(upon['pose'], beside['pose'], atol=1e-9)
+            # The reward's velocity of the centre of mass is that of the world.
+            com = next(term.weight for term in task.terms if term.name == 'com')
+            self.assertAlmostEqual(observed_terms(environment)['com'], com, delta=2e-3)
 
 
 class RewardTest(parameterized.TestCase):
     """The reward's worked values, and every term by hand."""
 
-    @parameterized.parameters(
-        # The errors of: perfect tracking; every joint and the root off by 0.2 rad; every rate by
-        # 2 rad/s; each foot by 0.1 m; the root by 0.1 m; the com's velocity by 1 m/s.
-        ((0, 0, 0, 0, 0), 'pose', 1.0), ((0.04, 0, 0, 0, 0), 'pose', 0.923),
-        ((0, 4, 0, 0, 0), 'velocity', 0.980), ((0, 0, 0.01, 0, 0), 'end_effector', 0.670),
-        ((0, 0, 0, 0, 0.01), 'root', 0.905), ((0, 0, 0, 0.1, 0), 'com', 0.368),
-    )  # fmt: skip
-    def test_worked_values(self, errors, term, factor):
-        outcome = terms.outcome(1, 0, len(errors))
-        data = terms.terms_data(rewards.IMITATION_TERMS)
-        for name, error in zip(data._fields, errors, strict=True):
-            terms.score(0, float(error), getattr(data, name), outcome)
-        found = dict(zip(data._fields, outcome.reward_terms[0].tolist(), strict=True))
-        self.assertAlmostEqual(found[term] / WEIGHTS[term], factor, delta=5e-4)
-        for other in set(found) - {term}:
-            self.assertAlmostEqual(found[other], WEIGHTS[other], delta=1e-12)
-
-    def test_weights_and_scales(self):
-        self.assertEqual({each.name: each.weight for each in rewards.IMITATION_TERMS}, WEIGHTS)
-        self.assertEqual({each.name: each.scale for each in rewards.IMITATION_TERMS}, SCALES)
-        self.assertAlmostEqual(sum(WEIGHTS.values()), 1, delta=1e-12)
-
     def test_joint_angles_are_wrapped(self):
         angles = np.array([0.3, -3.0, 2 * np.pi + 0.3, -7.0, 3 * np.pi + 0.1])
-        expected = np.angle(np.exp(1j * angles))
         found = [terms.wrapped(angle) for angle in angles]
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(found, wrapped(angles), atol=1e-12)
 
-    def by_hand(self, environment):
-        task = environment.task
-        name = task.character.spec.name
-        found = Probe(environment).reward_features()
-        wanted = Reference(environment).at(float(task.phase[0])).reward_features()
-        weights = np.array(RAW[name]) / np.sum(RAW[name])
-        turned = found['angles'] - wanted['angles']
-        turned[0] = np.angle(np.exp(1j * turned[0]))  # the trunk's shortest rotation
-        errors = {
-            'pose': weights @ turned**2,
-            'velocity': weights @ (found['rates'] - wanted['rates']) ** 2,
-            'end_effector': np.mean(
-                np.sum((found['effectors'] - wanted['effectors']) ** 2, axis=1)
-            ),
-            'com': 0.1 * np.sum((found['com_velocity'] - wanted['com_velocity']) ** 2),
-            'root': (found['height'] - wanted['height']) ** 2,
-        }
-        return {name: WEIGHTS[name] * np.exp(-SCALES[name] * e) for name, e in errors.items()}
-
-    @parameterized.parameters(*((id_, steps) for id_ in EXAMPLES for steps in (1, 6)))
+    @parameterized.product(id_=EXAMPLES, steps=(1, 6, 12))
     def test_terms_in_a_rollout(self, id_, steps):
         environment, step = started(id_, steps)
-        self.assertTrue(step.mid())
-        terms, expected = environment.info['reward_terms'], self.by_hand(environment)
+        if step.first():
+            return
+        found, expected = (
+            environment.info['reward_terms'],
+            probe(environment).terms(reference(environment)),
+        )
         for name, value in expected.items():
             # The task interpolates a table of the clip.
-            self.assertAlmostEqual(terms[name], value, delta=2e-3 * WEIGHTS[name], msg=name)
+            self.assertAlmostEqual(found[name], value, delta=2e-3 * WEIGHTS[name], msg=name)
         self.assertAlmostEqual(step.reward, sum(expected.values()), delta=2e-3)
 
-    @parameterized.parameters('dog', 'raptor', 'biped2d', 'biped2d_full')
-    def test_a_joint_error_costs_its_weight(self, name):
+    @parameterized.parameters(0.9, -2.0)
+    def test_only_the_centre_of_mass_term_depends_on_the_direction(self, heading):
+        # The pose of the clip, all of it turned: heading is removed everywhere but in `com`.
+        environment, _ = started(PLANE, start_phase=0.4)
+        clip, turned = environment.task.clip, np.zeros(4)
+        pose, rate = clip.pose(0.4 * clip.duration), clip.velocity(0.4 * clip.duration)
+        about = np.array([np.cos(heading / 2), 0, 0, np.sin(heading / 2)])
+        mujoco.mju_mulQuat(turned, about, pose[3:7])
+        pose[3:7], rate[:3] = turned, flattened(heading).T @ rate[:3]
+        put(environment, pose, rate)
+        found, velocity = observed_terms(environment), probe(environment).features()['com_velocity']
+        for name in ('pose', 'velocity', 'end_effector', 'root'):
+            self.assertAlmostEqual(found[name], WEIGHTS[name], delta=1e-3 * WEIGHTS[name])
+        # By a chord of the circle of its speed.
+        error = (2 * np.sin(heading / 2)) ** 2 * np.sum(velocity[:2] ** 2)
+        self.assertAlmostEqual(found['com'] / 0.2, np.exp(-error), delta=2e-3)
+
+    @parameterized.parameters(*((name, 0) for name in RAW), ('biped3d', 1))
+    def test_a_joint_error_costs_its_weight(self, name, axis):
         environment = suite.build(name, task_kwargs={'random': 0, 'start_phase': 0.3})
         environment.reset()
-        task, data = environment.task, environment.physics.named.data
-        task.observe()
-        before = observed_terms(environment)['pose']
+        character, data = environment.task.character, environment.physics.named.data
+        before, turn = observed_terms(environment)['pose'], np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, np.eye(3)[axis], 0.2)
         weights = np.array(RAW[name]) / np.sum(RAW[name])
-        for i, joint in enumerate(('root_pitch/', *task.character.spec.joints)):
-            data.qpos[f'{name}/{joint}'] += 0.2
+        joints = list(character.spec.joints)
+        balls = character.spherical.tolist()
+        if not character.spec.spatial:
+            joints, balls = ['root_pitch/', *joints], [False, *balls]
+        for weight, joint, ball in zip(weights[-len(joints) :], joints, balls, strict=True):
+            kept = data.qpos[f'{name}/{joint}'].copy()
+            turned = kept + 0.2
+            if ball:
+                mujoco.mju_mulQuat(turned, kept, turn)
+                turned = -turned  # the same rotation
+            data.qpos[f'{name}/{joint}'] = turned
             environment.physics.forward()
-            task.observe()
             after = observed_terms(environment)['pose']
-            data.qpos[f'{name}/{joint}'] -= 0.2
-            self.assertAlmostEqual(
-                after / before, np.exp(-2 * weights[i] * 0.04), delta=1e-3, msg=joint
-            )
+            data.qpos[f'{name}/{joint}'] = kept
+            expected = np.exp(-2 * weight * 0.04)
+            self.assertAlmostEqual(after / before, expected, delta=1e-3, msg=joint)
             self.assertLess(after, before)
 
-    @parameterized.parameters(*IDS)
-    def test_a_start_has_almost_full_reward(self, id_):
-        environment = made(id_, seed=21)
-        for _ in range(3):
-            environment.reset()
-            # No reward is given for a reset.
-            self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
-            start = observed_terms(environment)
-            self.assertAlmostEqual(start['pose'], 0.5, delta=1e-3)
-            self.assertAlmostEqual(start['velocity'], 0.05, delta=1e-3)
-            self.assertAlmostEqual(start['com'], 0.2, delta=2e-3)
-            # Lifted by a centimetre at most.
-            self.assertGreater(start['root'], 0.1 * np.exp(-10 * 0.01**2) - 1e-6)
-            self.assertGreater(start['end_effector'], 0.15 * np.exp(-40 * 0.01**2) - 1e-4)
+    @parameterized.product(id_=(*PLANAR_IDS, *SPATIAL_IDS), phase=(0.31, 0.77))
+    def test_the_reference_pose_has_full_reward(self, id_, phase):
+        environment, _ = started(id_, start_phase=phase)
+        clip, spatial = environment.task.clip, id_ in SPATIAL_IDS
+        pose, level = clip.pose(phase * clip.duration), probe(environment).ground
+        pose[: 2 if spatial else 1] = 0
+        pose[2 if spatial else 1] += float(level(0.0))
+        put(environment, pose, clip.velocity(phase * clip.duration))
+        grid = np.linspace(-1.5, 1.5, 61)
+        is_level = np.ptp(level(*np.meshgrid(grid, grid))) < 1e-12
+        found = observed_terms(environment)
+        for name, weight in WEIGHTS.items():
+            if is_level or name != 'end_effector':  # feet are measured from the ground below each
+                near = (2e-3 if spatial or name != 'velocity' else 2e-2) * weight
+                self.assertAlmostEqual(found[name], weight, delta=near, msg=name)
 
-    def test_standing_still_in_the_pose_of_a_walk(self):
-        environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
-        environment.reset()
-        task, speed = environment.task, environment.task.clip.speed
+    @parameterized.parameters(FLAT, PLANE)
+    def test_standing_still_in_the_pose_of_a_walk(self, id_):
+        environment, _ = started(id_)
+        task, factors = environment.task, []
         environment.physics.data.qvel[:] = 0
         environment.physics.forward()
-        factors = []
         for phase in np.linspace(0, 1, 40, endpoint=False):
             task.phase[0] = phase
-            task.observe()
             factors.append(observed_terms(environment)['com'] / 0.2)
         # exp(-speed^2) at the mean speed, for a speed of 1.535 m/s 0.095.
+        speed = task.clip.speed if id_ == FLAT else 1.2
         self.assertAlmostEqual(np.mean(factors), np.exp(-(speed**2)), delta=0.03)
+
+
+def corners(environment):
+    """Corners of all boxes of the character, (boxes * 8, 3) m."""
+    found = []
+    for geom in environment.task.character.collision_geoms:
+        bound = environment.physics.bind(geom)
+        box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T * bound.size
+        found.append(bound.xpos + box @ bound.xmat.reshape(3, 3).T)
+    return np.concatenate(found)
 
 
 class ResetTest(parameterized.TestCase):
     """Where and how episodes start."""
 
-    def test_phases_are_uniform(self):
-        environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
-        phases = []
-        for _ in range(800):
-            environment.reset()
-            phases.append(float(environment.task.phase[0]))
-        phases = np.sort(phases)
-        self.assertTrue((phases >= 0).all() and (phases < 1).all())
-        # Kolmogorov-Smirnov at a significance of 1 in 1000.
-        distance = np.abs(phases - (np.arange(800) + 0.5) / 800).max()
-        self.assertLess(distance, 1.95 / np.sqrt(800))
-
-    @parameterized.parameters(*IDS)
-    def test_on_the_ground_and_not_below(self, id_):
-        environment = made(id_, seed=31)
+    @parameterized.parameters(*PLANAR_IDS, *((preset, task) for preset in sorted(terrain.PRESETS3D)
+                                             for task in ('imitation', 'footsteps')))  # fmt: skip
+    def test_on_the_ground_and_not_below(self, where, task=None):
+        if task:
+            environment = made('biped3d_mocap', None, where, task, terrain_observation='height')
+        else:
+            environment = made(where)
+        environment.random_state.seed(31)
         for _ in range(4):
             environment.reset()
-            probe = Probe(environment)
-            self.assertEqual(probe.root[0], 0)
-            clearance = []
-            physics = environment.physics
-            for geom in environment.task.character.collision_geoms:
-                bound = physics.bind(geom)
-                corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T * bound.size
-                corners = bound.xpos + corners @ bound.xmat.reshape(3, 3).T
-                clearance.append((corners[:, 2] - probe.ground(corners[:, 0])).min())
-            self.assertGreater(min(clearance), 0.0005)
-            # Only lifted, never lowered; the ground about the start is level.
-            clip = environment.task.clip
-            pose = clip.pose(float(environment.task.phase[0]) * clip.duration)
-            lift = probe.root[1] - pose[1] - probe.ground(0.0)
-            self.assertGreater(lift, -1e-5)  # the reference is tabulated
-            if lift > 1e-9:
-                self.assertLess(min(clearance), 0.002)
-            data, model = physics.data.ptr, physics.model.ptr
-            contacts = model.geom_bodyid[data.contact.geom]
-            self.assertFalse((contacts == 0).any())  # the world's, the ground
+            found, places = probe(environment), corners(environment)
+            clearance = (places[:, 2] - found.ground(*places[:, :2].T)).min()
+            self.assertGreater(clearance, 0.0005)
+            if task == 'footsteps':
+                spawn = environment.task.travel.origin[0]
+                np.testing.assert_allclose(found.root[:2], spawn[:2], atol=1e-12)
+            else:
+                np.testing.assert_array_equal(found.root[:2], 0)
+                clip = environment.task.clip
+                pose = clip.pose(float(environment.task.phase[0]) * clip.duration)
+                lift = found.root[2] - pose[2 if task else 1] - found.ground(0.0)
+                self.assertGreater(lift, -1e-5)  # only lifted, never lowered
+                if lift > 1e-6:
+                    self.assertLess(clearance, 0.002)
+            step = environment.step(np.zeros(len(environment.action_map)))
+            self.assertTrue(step.mid())
+            for block in step.observation.values():
+                self.assertTrue(np.isfinite(block).all())
 
-    @parameterized.parameters(*EXAMPLES)
+    @parameterized.parameters(*PLANAR, PLANE)
     def test_pose_and_velocity_of_the_clip(self, id_):
         environment, _ = started(id_, start_phase=0.37)
-        clip, probe = environment.task.clip, Probe(environment)
+        clip, figure = environment.task.clip, environment.task.figure
         pose, rate = clip.pose(0.37 * clip.duration), clip.velocity(0.37 * clip.duration)
-        names = ['root_x/', 'root_z/', 'root_pitch/', *probe.links[1:]]
-        # The task interpolates a table of the clip.
-        np.testing.assert_allclose([probe.qpos(n) for n in names[2:]], pose[2:], atol=1e-4)
-        np.testing.assert_allclose([probe.qvel(n) for n in names], rate, atol=0.01)
+        data, first = environment.physics.data, 3 if id_ == PLANE else 2
+        # In the plane the task interpolates a table of the clip.
+        near = (1e-12, 1e-12) if id_ == PLANE else (1e-4, 0.01)
+        np.testing.assert_allclose(data.qpos[figure.pose_qpos][first:], pose[first:], atol=near[0])
+        np.testing.assert_allclose(data.qvel[figure.pose_dof], rate, atol=near[1])
 
-    def test_start_phase(self):
-        environment, step = started(BIPED, start_phase=0.6)
+    @parameterized.parameters(FLAT, PLANE)
+    def test_phases_are_uniform(self, id_):
+        environments, found = VectorEnvironment(id_, 100, 1, seed=0), []
+        for _ in range(8):
+            environments.reset()
+            found.append(environments.task.phase.copy())
+        self.assertLess(np.max(found), 1)
+        assert_uniform(np.ravel(found), 0, 1)
+
+    @parameterized.parameters(BIPED, HILLS)
+    def test_start_phase(self, id_):
+        environment, step = started(id_, start_phase=0.6)
         for _ in range(3):
-            self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-12)
+            self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-9)
             step = environment.reset()
-        bad_pairs = ((), (0.2, 0.4), ((0.4, 0.2),), ((0.2, 0.5), (0.4, 0.6)), ((0.5, 1.1),))
-        bad_pairs = (*bad_pairs, ((0.1, 0.2), (0.3,)), (('a', 'b'),), ((0.1, np.nan),))
-        for bad in (1.0, -0.1, np.nan, 'early', *bad_pairs):
-            with self.assertRaisesRegex(ValueError, 'start_phase is'):
-                suite.make(BIPED, {'start_phase': bad})
+        # The ground is redrawn, and does not depend on whether the phase is drawn or given.
+        grounds, x = [], np.linspace(-5, 5, 9)
+        for options in ({}, {'start_phase': 0.6}):
+            other = suite.make(id_, {'random': 5, **options})
+            other.reset()
+            grounds.append(probe(other).ground(x, np.ones(9)))
+        np.testing.assert_array_equal(*grounds)
+        self.assertGreater(np.abs(probe(environment).ground(x, np.ones(9)) - grounds[0]).max(), 0)
 
     def test_ranges_of_start_phases(self):
         pairs = ((0.1, 0.2), (0.5, 0.8))
@@ -405,16 +532,10 @@ class ResetTest(parameterized.TestCase):
         self.assertTrue((first | second).all())
         self.assertAlmostEqual(first.mean(), 0.25, delta=0.07)  # 3 standard deviations
         self.assertAlmostEqual(phases[second].mean(), 0.65, delta=0.02)
-
-    def test_raptor_with_muscles_starts_in_the_air(self):
+        # A raptor with muscles starts in the air.
         specs = VectorEnvironment('MTU_Raptor2D_LLC_Imitate_Flat-v0', 64, 1, 5)
         specs.reset()
         self.assertTrue((specs.task.phase % 0.5 >= 0.25).all())
-
-    def test_terrain_is_redrawn_at_reset(self):
-        environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': 3})
-        first, second = (environment.reset().observation['terrain'] for _ in range(2))
-        self.assertGreater(np.abs(first - second).max(), 1e-3)
 
     @parameterized.parameters(*EXAMPLES)
     def test_seeds(self, id_):
@@ -428,96 +549,138 @@ class ResetTest(parameterized.TestCase):
         np.testing.assert_array_equal(episode(1), episode(1))
         self.assertTrue((episode(1) != episode(2)).any())
 
-    def test_intended_spawn_is_flat_for_a_metre(self):
-        for seed in range(5):
-            environment = made('PD_Dog2D_Slopes_Terrain-v0', seed=seed)
+    def test_spawn(self):
+        """As intended, the ground is flat for a metre; where the original's segments meet, it may not be."""
+        rough = {'intended': 0, 'upstream': 0}
+        for seed, spawn in ((seed, spawn) for seed in range(8) for spawn in rough):
+            environment = made(SLOPES, seed=seed, spawn=spawn)
             environment.reset()
-            heights = Probe(environment).ground(np.linspace(-1, 1, 81))
-            np.testing.assert_array_equal(heights, 0)
-
-    def test_upstream_spawn(self):
-        # Where the original's segments meet depends on the phase; ground is level there or not.
-        rough = 0
-        for seed in range(8):
-            environment = suite.make(
-                'PD_Dog2D_Slopes_Terrain-v0', {'random': seed, 'spawn': 'upstream'}
-            )
-            environment.reset()
-            heights = Probe(environment).ground(np.linspace(-1, 1, 81))
-            rough += np.ptp(heights) > 0
+            rough[spawn] += np.ptp(probe(environment).ground(np.linspace(-1, 1, 81))) > 0
             for _ in range(30):
                 step = environment.step(np.zeros(20))
                 self.assertTrue(np.isfinite(step.observation['pose']).all())
-        self.assertGreater(rough, 0)
-        with self.assertRaisesRegex(ValueError, 'spawn'):
-            suite.make('PD_Dog2D_Slopes_Terrain-v0', {'spawn': 'nowhere'}).reset()
+        self.assertEqual(rough['intended'], 0)
+        self.assertGreater(rough['upstream'], 0)
 
     def test_terrain_level_selects_the_parameters(self):
-        reached = []
-        for terrain_level in (0.0, 1.0):
-            environment = suite.build(
-                'biped2d',
-                terrain='gaps_curriculum',
-                task_kwargs={'random': 0, 'terrain_level': terrain_level},
-            )
+        # Gaps of 0.1 to 0.25 m in the first set, of 0.5 to 1.5 m in the second.
+        for level, low, high in ((0.0, 0.1, 0.3), (1.0, 0.6, 1.4)):
+            options = {'random': 0, 'terrain_level': level}
+            environment = suite.build('biped2d', terrain='gaps_curriculum', task_kwargs=options)
             environment.reset()
             heights, vertical = environment.task.arena.grounds[0].window(0, 4000)
             edges = np.flatnonzero(vertical)
             widths = np.diff(edges)[heights[edges[:-1]] < -1]
-            reached.append(widths.mean() * 0.025)
-        # 0.1 to 0.25 m in the first set, 0.5 to 1.5 m in the second.
-        self.assertBetween(reached[0], 0.1, 0.3)
-        self.assertBetween(reached[1], 0.6, 1.4)
+            self.assertBetween(widths.mean() * 0.025, low, high)
+        content = {'Type': 'var3d_checkers', 'Params': [{'Slope': 0.0}, {'Slope': 0.2}]}
+        grid = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
+        for level, height in ((0.0, 0.0), (0.5, 0.1), (1.0, 0.2)):
+            options = {'random': 0, 'terrain_level': level}
+            environment = suite.build('biped3d', terrain=content, task_kwargs=options)
+            environment.reset()
+            self.assertAlmostEqual(np.ptp(ground(environment, *grid)), height, delta=1e-12)
 
 
-class HelperTest(parameterized.TestCase):
-    """What a task tells beyond the time step."""
+class ClipTest(parameterized.TestCase):
+    """What a task tells of its clip."""
 
-    @parameterized.parameters('PD_Dog2D_LLC_Imitate_Flat-v0', 'Vel_Dog2D_LLC_Imitate_Flat-v0')
-    def test_clip_action(self, id_):
-        environment, _ = started(id_, 3)
+    @parameterized.parameters(
+        ('dog', 'position', {}), ('dog', 'velocity', {}), ('biped3d', 'position', {}),
+        ('biped3d', 'position', {'action_offset': 'posture'}), ('biped3d', 'velocity', {}),
+        ('biped3d', 'position', {'mirrored': True, 'start_phase': 0.6}),
+    )  # fmt: skip
+    def test_clip_action(self, character, actuation, options):
+        environment = suite.build(character, actuation, task_kwargs={'random': 0, **options})
+        environment.reset()
         task, clip = environment.task, environment.task.clip
         time = float(task.phase[0]) * clip.duration
-        wanted = (clip.pose if id_.startswith('PD') else clip.velocity)(time)[3:]
-        control = task.action_map.action_offset + task.action_map.action_scale * task.clip_action(0)
-        np.testing.assert_allclose(control, wanted, atol=1e-12)
+        environment.step(task.clip_action(0))
+        control = environment.physics.data.ctrl.copy()
+        column = 7 if task.character.spec.spatial else 3
+        expected = clip.velocity(time)[6 if column == 7 else 3 :]
+        if actuation == 'position':
+            expected = []
+            for size in clip.sizes:
+                part = clip.pose(time)[column : column + size]
+                column += size
+                if size == 4:
+                    vector = np.zeros(3)
+                    mujoco.mju_quat2Vel(vector, part, 1.0)
+                    part = vector
+                expected.append(part)
+            expected = np.concatenate(expected)
+        np.testing.assert_allclose(control, expected, atol=1e-9)
 
-    @parameterized.parameters('Torque_Dog2D_LLC_Imitate_Flat-v0', MUSCLES)
-    def test_no_clip_action(self, id_):
-        environment, _ = started(id_)
-        with self.assertRaisesRegex(ValueError, 'cannot follow a clip open loop'):
-            environment.task.clip_action(0)
-
-    def test_reference_pose_walks_along(self):
-        environment, _ = started('PD_Biped2D_LLC_Imitate_Flat-v0', start_phase=0.25)
-        task = environment.task
-        x = []
-        for _ in range(90):
+    @parameterized.parameters((FLAT, 0.3), (PLANE, 0.15))
+    def test_reference_pose_walks_along(self, id_, near):
+        environment, _ = started(id_, start_phase=0.25)
+        task, x = environment.task, []
+        for _ in range(90 if id_ == FLAT else 15):
             x.append(task.reference_pose(0)[0])
             if environment.step(task.clip_action(0)).last():
                 break
         self.assertEqual(x[0], 0)
-        speed = (x[-1] - x[0]) / (len(x) - 1) * 30
-        self.assertAlmostEqual(speed, task.clip.speed, delta=0.3)
+        speed = task.clip.speed if id_ == FLAT else 1.2
+        self.assertAlmostEqual((x[-1] - x[0]) / (len(x) - 1) * 30, speed, delta=near)
 
-    @parameterized.parameters(
-        ({'terrain_observation': 1}, 'terrain_observation'), ({'terrain_observation': -1}, 'terrain_observation'),
-        ({'substeps': 3}, 'substeps'), ({'substeps': 4.5}, 'substeps'), ({'action_offset': 'mean'}, 'action_offset'),
-        ({'action_scale': 0}, 'action_scale'), ({'action_scale': np.inf}, 'action_scale'),
-    )  # fmt: skip
-    def test_options_out_of_range(self, options, message):
-        with self.assertRaisesRegex(ValueError, message):
-            suite.make(BIPED, options)
 
-    def test_clips_that_do_not_fit_are_rejected(self):
-        with self.assertRaisesRegex(ValueError, "'dog_bound'.*does not fit character 'raptor'"):
-            suite.build('raptor', clip='dog_bound')
-        clip = motion.load('biped2d_walk')
-        once = motion.Clip('once', clip.times, clip.poses, 'planar', clip.joints, clip.sizes)
-        with self.assertRaisesRegex(ValueError, 'does not loop'):
-            suite.build('biped2d', clip=once)
-        with self.assertRaisesRegex(ValueError, 'options of position control'):
-            suite.build('biped2d', 'torque', task_kwargs={'action_scale': 1.0})
+START_PHASES = (
+    1.0, -0.1, np.nan, 'early', (), (0.2, 0.4), ((0.4, 0.2),), ((0.2, 0.5), (0.4, 0.6)), ((0.5, 1.1),),
+    ((0.1, 0.2), (0.3,)), (('a', 'b'),), ((0.1, np.nan),),
+)  # fmt: skip
+REFUSED = (
+    *((id_, {'start_phase': value}, 'start_phase is') for id_ in (BIPED, PLANE) for value in START_PHASES),
+    *((id_, options, message) for id_ in (BIPED, PLANE) for options, message in (
+        ({'substeps': 3}, 'substeps is 3'), ({'substeps': 10.5}, 'substeps is 10.5'),
+        ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
+        ({'action_scale': 0}, 'action_scale is 0'), ({'action_scale': np.inf}, 'action_scale is inf'),
+        ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),
+        ({'plans': {}}, "unknown option.*'plans'"),
+    )),
+    (BIPED, {'terrain_observation': 1}, 'terrain_observation is 1'),
+    (BIPED, {'terrain_observation': -1}, 'terrain_observation is -1'),
+    (BIPED, {'spawn': 'nowhere'}, "spawn 'nowhere'"),
+    (PLANE, {'substeps': 5}, 'substeps is 5'),
+    (PLANE, {'action_scale': 1.0, 'action_offset': 'original'}, 'takes no action_scale'),
+    (PLANE, {'mirrored': True, 'reference_observation': True}, 'mirrored observations need the phase'),
+    (PLANE, {'terrain_observation': 50}, 'terrain_observation is 50; expected a string'),
+)  # fmt: skip
+DO_NOT_FIT = (  # arguments of `suite.build`
+    (('raptor', None, None, 'imitation', 'dog_bound'), "'dog_bound'.*does not fit character 'raptor'"),
+    (('biped2d', 'torque', None, 'imitation', None, {'action_scale': 1.0}), 'options of position control'),
+    (('biped3d', 'torque', None, 'imitation', None, {'action_scale': 1.0}), 'options of position control'),
+    (('biped3d', 'velocity', None, 'imitation', None, {'action_offset': 'posture'}), 'options of position control'),
+    (('biped3d', None, None, 'imitation', 'biped2d_walk'), "'biped2d_walk'.*free root"),
+    (('biped3d', None, None, 'imitation', 'biped3d_full_walk'),
+     "'biped3d_full_walk'.*does not fit character 'biped3d'"),
+    (('biped3d', 'muscle'), 'has no muscles'),
+)  # fmt: skip
+
+
+class OptionTest(parameterized.TestCase):
+    def test_refused(self):
+        assert_refused(
+            self, *((lambda i=i, o=o: suite.make(i, o), message) for i, o, message in REFUSED)
+        )
+
+    def test_parts_that_do_not_fit_are_rejected(self):
+        assert_refused(self, *((lambda a=a: suite.build(*a), message) for a, message in DO_NOT_FIT))
+        walk = motion.load('biped2d_walk')
+        once = motion.Clip('once', walk.times, walk.poses, 'planar', walk.joints, walk.sizes)
+        sizes = (1, 4, 4, 4, 4, 1, 4)  # those of the torso and of the right knee are exchanged
+        pose = [0, 0, 1, 1, 0, 0, 0] + [n for size in sizes for n in [1, 0, 0, 0][:size]]
+        joints = motion.load('biped3d_walk').joints
+        other = motion.Clip('other', (0, 1), [pose, pose], 'free', joints, sizes, loop=True)
+        step = motion.load_steps('biped3d_mocap').clip(2)
+        limp = [suite.build('dog', model) for model in ('torque', 'muscle')]
+        limp.append(suite.build('biped3d', 'torque'))
+        assert_refused(
+            self,
+            (lambda: suite.build('biped2d', clip=once), 'does not loop'),
+            (lambda: suite.build('biped3d', clip=other), "for its joints; character 'biped3d' has"),
+            (lambda: suite.build('biped3d_mocap', clip=step), 'not looping'),
+            *((lambda e=e: e.reset() and e.task.clip_action(0), 'cannot follow a clip open loop') for e in limp),
+        )  # fmt: skip
 
 
 if __name__ == '__main__':
