@@ -21,6 +21,7 @@ import pathlib
 import shutil
 from typing import Any
 
+import pages
 import ppo
 import runs
 import tqdm
@@ -29,7 +30,7 @@ from settings import RANDOMIZED, randomized_settings_for
 from train_all import SEED
 
 from trl_suite import evaluation, policies
-from trl_suite.util import errors, files
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
@@ -38,7 +39,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     **{name: {'randomize': name, 'sensors': name} for name in ('mild', 'robot', 'harsh')},
 }
 RESULTS = ('return', 'return_interval', 'completion_rate', 'distance', 'episodes', 'seed')
-_MARK, _END = '<!-- randomized, written by training/train_randomized.py -->', '<!-- /randomized -->'
+TITLES = {'before': 'shipped', 'evaluations': 'randomized, `{}`'}  # of the policies
 
 
 def place(id_: str) -> str:
@@ -79,35 +80,28 @@ def preset(entry: dict[str, Any]) -> str:
 
 def table(entries: list[dict[str, Any]]) -> str:
     """Returns the results as Markdown."""
-    episodes = [
-        result['episodes']
-        for entry in entries
-        for name in ('evaluations', 'before')
-        for result in entry[name].values()
-    ]
-    lines = [
+    found = [each for entry in entries for name in TITLES for each in entry[name].values()]
+    episodes = [each['episodes'] for each in found]
+    text = (
         f'Mean returns of {min(episodes)} to {max(episodes)} episodes with 95 % confidence, and in brackets the share of '
         'complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` what the '
-        'training has cost without disturbances.',
-        '',
-        '| environment | policy | none | mild | robot | harsh | robot / none | none / shipped |',
-        '|---|---|---|---|---|---|---|---|',
-    ]
+        'training has cost without disturbances.'
+    )
+    rows = []
     for entry in entries:
-        shipped = entry['before']['none']['return']
-        titles = {'before': 'shipped', 'evaluations': f'randomized, `{preset(entry)}`'}
-        for name, title in titles.items():
-            found = entry[name]
-            cells = ' | '.join(
-                f'{each["return"]:.1f} ± {each["return_interval"]:.1f} ({each["completion_rate"]:.0%})'
-                for each in (found[condition] for condition in CONDITIONS)
-            )
-            none, robot = (found[condition]['return'] for condition in ('none', 'robot'))
-            id_ = f'`{entry["id"]}`' if name == 'before' else ''
-            lines.append(
-                f'| {id_} | {title} | {cells} | {robot / none:.2f} | {none / shipped:.2f} |'
-            )
-    return '\n'.join(lines)
+        for name, title in TITLES.items():
+            each, shipped = entry[name], entry['before']['none']['return']
+            none, robot = each['none']['return'], each['robot']['return']
+            rows.append([
+                f'`{entry["id"]}`' if name == 'before' else '', title.format(preset(entry)),
+                *(
+                    f'{r["return"]:.1f} ± {r["return_interval"]:.1f} ({r["completion_rate"]:.0%})'
+                    for r in map(each.get, CONDITIONS)
+                ),
+                f'{robot / none:.2f}', f'{none / shipped:.2f}',
+            ])  # fmt: skip
+    head = ['environment', 'policy', *CONDITIONS, 'robot / none', 'none / shipped']
+    return f'{text}\n\n{pages.table(head, rows)}'
 
 
 def main() -> None:
@@ -118,9 +112,7 @@ def main() -> None:
     parser.add_argument('--overwrite', action='store_true', help='repeat runs that are entered')
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
-    for id_ in arguments.ids:
-        if id_ not in RANDOMIZED:
-            raise ValueError(errors.unknown('environment', id_, RANDOMIZED))
+    errors.check_known('environment', RANDOMIZED, *arguments.ids)
     entries = []
     for id_ in tqdm.tqdm(arguments.ids, unit='run'):
         if arguments.overwrite:
@@ -131,7 +123,7 @@ def main() -> None:
     text = table(entries)
     print(text)
     if arguments.page is not None:
-        files.replace_between(arguments.page, _MARK, _END, text)
+        pages.replace(arguments.page, 'randomized', 'train_randomized', text)
 
 
 if __name__ == '__main__':
