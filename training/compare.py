@@ -124,8 +124,9 @@ TASKS = {  # with and without hierarchy; what counts: key, factor and label
 KINDS = ('with hierarchy', 'without')
 SCRATCH: dict[str, Any] = {'stages': (), 'averaged': 0.0, 'stages_averaged': 1}
 OWN: tuple[dict[str, Any], ...] = (
-    {'start': '', 'activation': 'tanh', 'convolutions': ()}, settings.FROM_A_WALK,
-)  # fmt: skip
+    {'start': '', 'activation': 'tanh', 'convolutions': ()},
+    settings.FROM_A_WALK,
+)
 QUARTERS, HIERARCHY_EPISODES = 4, 32
 
 

@@ -102,9 +102,10 @@ def section(folder: pathlib.Path) -> str:
     stages, first = min(len(result['scores']) for result in every), every[0]
     names = [terrain(id_) for id_ in first['ids']]
     part = (
-        f'all {stages} stages' if stages == len(names)
+        f'all {stages} stages'
+        if stages == len(names)
         else f'the first {stages} of {len(names)} stages ({", ".join(names[:stages])})'
-    )  # fmt: skip
+    )
 
     def by_environment(values: Callable[[str, Result], list[float]], begin: int = 0) -> str:
         """Returns a table of values (learner, result) -> of each environment from `begin` on."""

@@ -158,13 +158,14 @@ def of_gait(
             found[i, back] = prevented(copies, states, act, MOST_CYCLES, place + margin)
     own, *parts = np.split(found, ends[:-1], axis=2)
     return {
-        'passed': round(margin, 3), 'own': float(own.mean()),
+        'passed': round(margin, 3),
+        'own': float(own.mean()),
         **{
             kind: {'actions': part.shape[2], **shares(part)}
             for kind, part in zip(('base', 'random', 'nudged'), parts, strict=True)
         },
         'ever_prevented': float((parts[0].any(2) | parts[1].any(2)).any(1).mean()),
-    }  # fmt: skip
+    }
 
 
 def of_tracking(

@@ -418,10 +418,11 @@ class Trainer:
     def save(self, folder: pathlib.Path) -> None:
         """Writes checkpoint and curve."""
         state = {
-            **{name: getattr(self, name) for name in _STATE}, **self.learnt(),
+            **{name: getattr(self, name) for name in _STATE},
+            **self.learnt(),
             'settings': dataclasses.asdict(self.settings),
             'environments': self.environments.get_state(),
-        }  # fmt: skip
+        }
         runs.write_curve(folder, self.spec.id, self.seed, self.settings, self.threads, self.curve)
         # Last: a run that continues from it finds all other files.
         runs.save(state, folder / 'checkpoint.pt')
@@ -540,10 +541,11 @@ def _train(
             bar.update(trainer.samples - before)
             returned, steps, number = trainer.recent.tolist()
             bar.set_postfix(
-                reward=f'{returned / max(steps, 1):.2f}', length=f'{steps / max(number, 1):.0f}',
+                reward=f'{returned / max(steps, 1):.2f}',
+                length=f'{steps / max(number, 1):.0f}',
                 score=f'{trainer.curve[-1]["normalized_return"]:.2f}' if trainer.curve else '-',
                 refresh=False,
-            )  # fmt: skip
+            )
             if (
                 runs.passed(before, trainer.samples, settings.evaluate_every)
                 or trainer.samples >= total

@@ -532,7 +532,7 @@ RANDOMIZED: dict[str, dict[str, Any]] = {
     'PD_Biped3D_Imitate-v0': FEWER,
     # Plans and rewards of the last stage of its training; pushes are those of the preset.
     'PD_Biped3D_LLC_General_Step-v0': {**FEWER, 'stages': STAGES[-1:]},
-}  # fmt: skip
+}
 
 
 def matching(id_: str, rows: Iterable[Row]) -> dict[str, Any]:
