@@ -22,10 +22,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.engine import memory
-from trl_suite.engine.memory import get, put
 from trl_suite.util import random
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.compiled import address, compiled, compiled_inline, floats_at
 
 QPOS, QVEL, CTRL, APPLIED, FORCE, RANGE = range(6)  # columns of `Motors.fields`
 UNLIMITED = 1e10  # N m
@@ -175,7 +173,7 @@ def motors(
     """
     fields = [
         [
-            memory.address(array)
+            address(array)
             for array in (
                 each.qpos, each.qvel, each.ctrl, each.qfrc_applied, each.actuator_force,
                 model.actuator_forcerange,
@@ -200,6 +198,18 @@ def _state(n: int, units: int, slots: int, controls: int, dofs: int) -> MotorSta
         noise=np.zeros((n, dofs)),
         stream=random.Streams(n).state,
     )
+
+
+@compiled_inline
+def get(address: int, k: int) -> float:
+    """Returns number k of the floats at an address."""
+    return floats_at(address, k + 1)[k]
+
+
+@compiled_inline
+def put(address: int, k: int, value: float) -> None:
+    """Writes number k of the floats at an address."""
+    floats_at(address, k + 1)[k] = value
 
 
 # Functions of simulation i.

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.engine import memory, motors, pushes
-from trl_suite.util.compiled import Compiled, compiled
+from trl_suite.engine import motors, pushes
+from trl_suite.util.compiled import Compiled, compiled, copy_floats, ints_at
 
 # Functions of type void f(const mjModel*, mjData*), in the order of `Engine.functions`.
 NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData', 'mj_fwdActuation')
@@ -155,7 +155,7 @@ def arrays_to_physics(i: int, engine: Engine) -> None:
     """Copies the fields that tasks may write from the arrays to the physics."""
     for k in range(min(engine.written, len(engine.sizes))):
         size = engine.sizes[k]
-        memory.copy(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
+        copy_floats(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
 
 
 @compiled
@@ -163,7 +163,7 @@ def physics_to_arrays(i: int, engine: Engine) -> None:
     """Copies all fields from the physics to the arrays."""
     for k in range(len(engine.sizes)):
         size = engine.sizes[k]
-        memory.copy(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
+        copy_floats(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
 
 
 @compiled
@@ -201,10 +201,10 @@ def begin_push(i: int, nstep: int, engine: Engine, given: pushes.Pushes | None) 
     if not pushes.advance(i, engine.time[i], nstep * engine.timestep, given):
         return False
     force, place = given.forces[i] + _FORCE_STRIDE * given.body[0], given.places[i]
-    memory.copy(place, force, 3)
+    copy_floats(place, force, 3)
     for k in range(3):
         given.scratch[i, 3 + k] += given.scratch[i, k]
-    memory.copy(force, place + 3 * _NUMBER, 3)
+    copy_floats(force, place + 3 * _NUMBER, 3)
     return True
 
 
@@ -214,7 +214,7 @@ def end_push(i: int, given: pushes.Pushes | None) -> None:
     if given is None:
         return
     force = given.forces[i] + _FORCE_STRIDE * given.body[0]
-    memory.copy(force, given.places[i], 3)
+    copy_floats(force, given.places[i], 3)
 
 
 @compiled
@@ -261,7 +261,7 @@ def reset(i: int, engine: Engine) -> None:
 def diverged(i: int, engine: Engine) -> bool:
     """Returns whether a simulation has had a non-finite or huge state since its reset."""
     for k in range(_BAD[0], _BAD[1]):
-        if memory.count(engine.warnings[i] + _WARNING_STRIDE * k) > 0:
+        if ints_at(engine.warnings[i] + _WARNING_STRIDE * k, 1)[0] > 0:
             return True
     return False
 

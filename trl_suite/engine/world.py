@@ -18,8 +18,7 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.engine import motors, native, pushes
-from trl_suite.engine.memory import address
-from trl_suite.util.compiled import packed
+from trl_suite.util.compiled import address, packed
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
 WRITABLE = (

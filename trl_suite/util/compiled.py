@@ -31,6 +31,7 @@ as it does with those that have free variables or no source file. With `NUMBA_DI
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import importlib.metadata
@@ -45,6 +46,8 @@ import time
 import warnings
 from collections.abc import Callable
 from typing import Any
+
+import numpy as np
 
 from trl_suite.util import files, interrupts
 
@@ -142,6 +145,48 @@ def packed(value: Any) -> Any:
     from trl_suite.util.pack import Pack
 
     return Pack(value)
+
+
+# Memory at addresses.
+
+
+def address(array: np.ndarray) -> int:
+    """Returns the address of the first number of an array; the caller keeps the array alive."""
+    return array.__array_interface__['data'][0]
+
+
+def _array_at(kind: str) -> Compiled:
+    """Returns a function from an address and a length to an array of that memory."""
+
+    def array_at(address: int, count: int) -> np.ndarray:
+        memory: Any = (ctypes.c_byte * (8 * int(count))).from_address(int(address))
+        return np.ndarray(int(count), kind, memory)
+
+    def native() -> Callable[..., Any]:
+        from numba import carray, types
+        from numba.extending import intrinsic
+
+        def pointer(typing: Any, address: Any) -> Any:
+            def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+                return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+            return types.CPointer(getattr(types, kind))(types.int64), generate
+
+        to: Any = intrinsic(pointer)
+        return lambda address, count: carray(to(address), (count,))
+
+    return Compiled(array_at, native)
+
+
+floats_at, ints_at = _array_at('float64'), _array_at('int32')
+
+
+@compiled
+def copy_floats(target: int, source: int, count: int) -> None:
+    """Copies numbers from one address to another."""
+    to, of = floats_at(target, count), floats_at(source, count)
+    for k in range(count):
+        to[k] = of[k]
 
 
 @functools.cache
