@@ -101,11 +101,12 @@ class Compiled:
         options |= {'forceinline': self._inline, 'no_cfunc_wrapper': True}
         if not entry:
             options |= {'no_cpython_wrapper': True, 'pipeline_class': machine_code.PartCompiler}
-        if self._native is not None:  # not cached, since it is short; its callers are cached
-            return numba.njit(self._native(), _nrt=True, **options)
-        dispatcher = numba.njit(self.function, _nrt=False, **options)
-        code = self.function.__code__
-        if entry and not code.co_freevars and os.path.isfile(code.co_filename):
+        function = self.function if self._native is None else self._native()
+        own, code = function is self.function, self.function.__code__
+        dispatcher = numba.njit(function, _nrt=not own, **options)
+        if not entry:
+            machine_code.compile_once(dispatcher)
+        elif own and not code.co_freevars and os.path.isfile(code.co_filename):
             machine_code.Cache(self.function, cache_folder()).attach(dispatcher)
         return dispatcher
 

@@ -68,6 +68,15 @@ class PartCompiler(Compiler):
         super().__init__(typing_context, target_context, library, *rest)
 
 
+def compile_once(dispatcher: Any) -> None:
+    """Makes a dispatcher use the same code for all constants of a type in calls.
+
+    Numba would compile `f(i, True)` and `f(i, False)` separately.
+    """
+    compile_ = dispatcher.compile
+    dispatcher.compile = lambda signature: compile_(tuple(map(numba.types.unliteral, signature)))
+
+
 class Cache(NullCache):
     """What a dispatcher of Numba asks for the code of a function before it compiles it."""
 
