@@ -53,9 +53,8 @@ class ActionMap:
 
     def drive(self, first: int) -> Drive:
         """Returns the map for compiled functions; `first` is the address of the first control."""
-        vectors, none = np.zeros((0, 3), int), np.zeros(0, int)
-        offset, scale, hinges = self.action_offset, self.action_scale, np.zeros((2, 0), int)
-        return Drive(offset, scale, first, vectors, np.zeros(0), none, vectors, hinges)
+        none = np.zeros((0, 3), int), np.zeros(0)
+        return Drive(self.action_offset, self.action_scale, first, *none)
 
     @functools.cached_property
     def _rows(self) -> tuple[np.ndarray, ...]:
@@ -98,8 +97,8 @@ class Drive(NamedTuple):
       first: address of the first control.
       torque_balls: indices of the torques of each ball joint, (B, 3), if the map is a `TorqueMap`.
       torque_limits: largest norm of the torque of each ball joint, (B,), likewise.
-      angles, angle_balls, hinges: fields of an `AngleAxisMap`, (B,), (B, 3) and (2, H). Fields of
-        another type of map are empty.
+      angles, angle_balls, hinges: fields of an `AngleAxisMap`, (B,), (B, 3) and (2, H); None for
+        another type of map.
     """
 
     offset: np.ndarray
@@ -107,9 +106,9 @@ class Drive(NamedTuple):
     first: int
     torque_balls: np.ndarray
     torque_limits: np.ndarray
-    angles: np.ndarray
-    angle_balls: np.ndarray
-    hinges: np.ndarray
+    angles: np.ndarray | None = None
+    angle_balls: np.ndarray | None = None
+    hinges: np.ndarray | None = None
 
 
 @compiled_inline
@@ -121,8 +120,7 @@ def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
 @compiled
 def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
     """Writes the controls of simulation i for its action, `action[i]`, clipped to [-1, 1]."""
-    if len(by.angles):
-        _drive_rotations(i, action, by, ctrl)
+    if _drive_rotations(i, action, by, ctrl, by.angles, by.angle_balls, by.hinges):
         return
     for k in range(len(by.offset)):
         ctrl[i, by.first + k] = _meant(i, k, action, by)
@@ -137,12 +135,26 @@ def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
 
 
 @compiled
-def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
-    """Writes the rotation vectors of ball joints from angles and axes; see `AngleAxisMap`."""
-    for k in range(by.hinges.shape[1]):
-        ctrl[i, by.first + by.hinges[1, k]] = _meant(i, by.hinges[0, k], action, by)
-    for ball in range(len(by.angles)):
-        column = by.angles[ball]
+def _drive_rotations(
+    i: int,
+    action: np.ndarray,
+    by: Drive,
+    ctrl: np.ndarray,
+    angles: np.ndarray | None,
+    balls: np.ndarray | None,
+    hinges: np.ndarray | None,
+) -> bool:
+    """Writes the rotation vectors of ball joints from angles and axes; see `AngleAxisMap`.
+
+    Returns:
+      Whether the actions have these; otherwise, nothing is written, nor compiled.
+    """
+    if angles is None or balls is None or hinges is None:
+        return False
+    for k in range(hinges.shape[1]):
+        ctrl[i, by.first + hinges[1, k]] = _meant(i, hinges[0, k], action, by)
+    for ball in range(len(angles)):
+        column = angles[ball]
         angle = _meant(i, column, action, by)
         x = _meant(i, column + 1, action, by)
         y = -_meant(i, column + 3, action, by)
@@ -151,9 +163,10 @@ def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) ->
         if length == 0.0:
             x, y, z, length = 0.0, -1.0, 0.0, 1.0
         share = angle / length
-        ctrl[i, by.first + by.angle_balls[ball, 0]] = x * share
-        ctrl[i, by.first + by.angle_balls[ball, 1]] = y * share
-        ctrl[i, by.first + by.angle_balls[ball, 2]] = z * share
+        ctrl[i, by.first + balls[ball, 0]] = x * share
+        ctrl[i, by.first + balls[ball, 1]] = y * share
+        ctrl[i, by.first + balls[ball, 2]] = z * share
+    return True
 
 
 @dataclasses.dataclass(frozen=True)
