@@ -128,12 +128,7 @@ class PlanarArena(composer.Arena):
         assert strip is not None
         start = centre - BEHIND
         heights, vertical = strip.window(start - BEFORE, VERTICES)
-        ground = PlanarWindows(*(array[env_id] for array in self.ground))
-        if (
-            start == ground.start
-            and (heights == ground.heights).all()
-            and (vertical == ground.vertical).all()
-        ):
+        if not _fill(env_id, start, heights, vertical, self._ground):
             return  # as on flat ground: boxes need not move
         tolerance = boxes.TOLERANCE
         surface = heights[BEFORE:], vertical[BEFORE:]
@@ -141,17 +136,31 @@ class PlanarArena(composer.Arena):
         while pieces.number > len(self.boxes):  # a coarser surface is better than one with holes
             tolerance *= 2
             if tolerance > COARSEST:
+                self.ground.start[env_id] = np.nan
                 raise ValueError(
                     f'terrain {self.terrain.name!r} needs {pieces.number} boxes for '
                     f'{(BEHIND + AHEAD) * SPACING:g} m; expected at most {len(self.boxes)}, as '
                     f'estimated from {PROBES} random windows; distribute its features more evenly'
                 )
             pieces = boxes.cut(start, *surface, tolerance)
-        ground.heights[:], ground.rises[:-1] = heights, np.diff(heights)
-        ground.vertical[:], self.ground.start[env_id] = vertical, start
         end = (start + BEHIND + AHEAD) * SPACING
         boxes.pose(pieces, surface[1], boxes.angles(pieces), end, self._pools[env_id])
         self._world.set_const(env_id, ground_only=True)
+
+
+@compiled
+def _fill(
+    i: int, start: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarWindows
+) -> bool:
+    """Writes the vertices of a window; returns whether it had other ones."""
+    changed = start != ground.start[i]
+    ground.start[i] = start
+    for k in range(VERTICES):
+        changed |= heights[k] != ground.heights[i, k] or vertical[k] != ground.vertical[i, k]
+        ground.heights[i, k], ground.vertical[i, k] = heights[k], vertical[k]
+        if k > 0:
+            ground.rises[i, k - 1] = heights[k] - heights[k - 1]
+    return changed
 
 
 @compiled
