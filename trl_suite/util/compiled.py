@@ -18,14 +18,15 @@ index raises an IndexError. It runs without the global interpreter lock.
 A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
 in every caller. Python passes tuples of arrays to loops over simulations as packs, see `packed`.
 
-Numba is imported and a function is compiled when it is first called from Python, with all that it
-calls as one piece of code. Its machine code is kept in the
-folder trl_suite/kernels/HASH in `$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends
-on all sources of the package, since compiled functions contain constants and code of other modules.
-Folders are used only if they belong to the user and nobody else can write there, because loading
-machine code runs it; files are checked, and functions that another process compiles are waited for, as
-`trl_suite.util.machine_code` says. Without such a folder every process compiles the functions again,
-as it does with those that have free variables or no source file. With `NUMBA_DISABLE_JIT=1` the same code runs as Python, for debugging.
+Numba is imported and a function is compiled when it is first called from Python, as one piece of code
+with all that it calls. Its machine code is kept in the folder trl_suite/kernels/HASH in
+`$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends on all sources of the package,
+since compiled functions contain constants and code of other modules. Folders are used only if they
+belong to the user and nobody else can write there, because loading machine code runs it; files are
+checked, and functions that another process compiles are waited for, as `trl_suite.util.machine_code`
+says. Without such a folder every process compiles the functions again, as it does with those that
+have free variables or no source file. With `NUMBA_DISABLE_JIT=1` the same code runs as Python, for
+debugging.
 """
 
 from __future__ import annotations
