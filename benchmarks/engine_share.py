@@ -102,7 +102,8 @@ def batch(id_: str, num_envs: int, seconds: float) -> dict[str, float]:
     environments.reset()
     rng, size = np.random.default_rng(0), len(environments.action_map)
     instrument(environments.task.world)
-    begin = environments.begin
+    core: Any = environments.core
+    begin = core.begin
     resets = [0, 0.0]
 
     def counted(env_ids: np.ndarray) -> None:
@@ -111,7 +112,7 @@ def batch(id_: str, num_envs: int, seconds: float) -> dict[str, float]:
         resets[0] += len(env_ids)
         resets[1] += time.perf_counter() - moment
 
-    environments.begin = counted  # type: ignore[method-assign]
+    core.begin = counted
     actions = rng.uniform(-1, 1, (64, num_envs, size))
     for k in range(40):
         environments.step(actions[k % 64])

@@ -405,9 +405,8 @@ class RobustnessTest(parameterized.TestCase):
         for call in (
             lambda: environments.step(np.zeros((3, 6))), environments.reset, environments.render,
             environments.get_state, lambda: environments.set_state(state),
-            lambda: environments.seed(1), lambda: environments.begin(np.arange(3)),
-            lambda: environments.share(print, np.arange(3)), lambda: environments.info,
-            lambda: environments.task, lambda: environments.copy_from(other, [0], [0]),
+            lambda: environments.seed(1), lambda: environments.info, lambda: environments.task,
+            lambda: environments.copy_from(other, [0], [0]),
             lambda: other.copy_from(environments, [0], [0]),
         ):  # fmt: skip
             with self.assertRaisesRegex(RuntimeError, 'the environment is closed'):

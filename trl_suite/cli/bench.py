@@ -110,10 +110,9 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     environments, drawn = warmed(id, num_envs, threads)
     others, _ = warmed(id, num_envs, threads)
     world: Any = others.task.world
-    begin = Stopwatch(environments.begin, len)
-    environments.begin = begin  # type: ignore[method-assign]
-    parallel = Stopwatch(environments.share, lambda *_: num_envs)
-    environments.share = parallel  # type: ignore[method-assign]
+    core: Any = environments.core
+    core.begin = begin = Stopwatch(core.begin, len)
+    core.share = parallel = Stopwatch(core.share, lambda *_: num_envs)
     before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
     directly = acts_directly(others, world.models[0])  # else controls are 0

@@ -113,6 +113,19 @@ class Core:
             del self.task, self.world  # whose arrays would keep models and data in memory
         return True
 
+    def share(self, work: Callable[[np.ndarray], None], ids: np.ndarray) -> None:
+        """Calls `work` on the threads, each time for a part of some simulations."""
+        if self.task.in_parts:
+            self.world.share(work, ids)
+        else:
+            work(ids)
+
+    def begin(self, ids: np.ndarray) -> None:
+        """Begins episodes in some simulations."""
+        if len(ids):
+            self.task.begin(ids, [self.random[env_id] for env_id in ids.tolist()])
+            self.restart(ids)
+
     def restart(self, ids: Any) -> None:
         """Notes that an episode begins in some simulations; `ids` is an index, or several."""
         self.steps[ids], self.ended[ids], self.fresh = 0, False, False
@@ -129,6 +142,7 @@ class Core:
           Whether they reached a limit, also if they failed.
         """
         steps = self.steps[ids] = self.steps[ids] + 1
+        # NumPy's False: an operation of a NumPy bool with Python's takes half a microsecond.
         at_limit = np.False_ if step_limit is None else steps >= step_limit
         if time_limit < math.inf:
             at_limit = at_limit | (self.world.time[ids] >= time_limit - TIME_ERROR)

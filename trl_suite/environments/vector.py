@@ -10,7 +10,7 @@ any number of simulations and threads, and whenever other simulations are reset.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,7 +179,7 @@ class VectorEnvironment:
                 self.seed(seed, ids)
             if level is not None:
                 core.task.choose_level(ids, level)
-            self.share(self.begin, ids)
+            core.share(core.begin, ids)
             return self._blocks(core.task.seen.observation.astype(self.dtype))
 
     def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
@@ -215,7 +215,7 @@ class VectorEnvironment:
 
         def work(part: np.ndarray) -> None:
             over = np.isin(part, resetting)
-            self.begin(part[over])
+            core.begin(part[over])
             task.advance(action, part[~over])
             # A slice is copied faster than an array of indices.
             near = len(part) and part[-1] - part[0] == len(part) - 1
@@ -223,7 +223,7 @@ class VectorEnvironment:
             observation[env_ids] = task.seen.observation[env_ids]
 
         observation = np.empty(task.seen.observation.shape, self.dtype)
-        self.share(work, asked)
+        core.share(work, asked)
         self.at_limit = np.zeros(self.num_envs, bool)
         self.at_limit[stepped] = core.count(stepped, self.step_limit, self.time_limit)
         reward, terminated, info = task.seen.reward.copy(), task.seen.failed.copy(), task.info()
@@ -237,7 +237,7 @@ class VectorEnvironment:
             info['ended'] = ended = core.ended.copy()
             if ended.any():
                 info['final_observation'] = self._blocks(task.seen.observation.astype(self.dtype))
-                self.share(self.begin, ended.nonzero()[0])
+                core.share(core.begin, ended.nonzero()[0])
                 observation = task.seen.observation.astype(self.dtype)
         if len(asked) < self.num_envs:
             observation = task.seen.observation.astype(self.dtype)
@@ -337,21 +337,6 @@ class VectorEnvironment:
             'a vector environment cannot be pickled; pickle its arguments (id, num_envs, seed) and '
             'get_state(), and construct a new one from these'
         )
-
-    def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
-        """Calls `work` on the threads, each time for a part of the simulations."""
-        core = self.core.usable()
-        if core.task.in_parts:
-            core.world.share(work, env_ids)
-        else:
-            work(env_ids)
-
-    def begin(self, env_ids: np.ndarray) -> None:
-        """Begins episodes in some simulations, without the checks and observations of `reset`."""
-        core = self.core.usable()
-        if len(env_ids):
-            core.task.begin(env_ids, [core.random[env_id] for env_id in env_ids.tolist()])
-            core.restart(env_ids)
 
     def _blocks(self, flat: np.ndarray) -> Any:
         """Returns observations (n, size) in the form that the user gets: an array, or a dict."""
