@@ -180,10 +180,13 @@ def observe(i: int, data: FootstepData) -> None:
 
 @compiled
 def land_all(env_ids: np.ndarray, data: FootstepData) -> int:
-    """Detects landings; returns how many simulations need a new plan."""
+    """Detects landings, and finishes other steps; returns how many simulations need a new plan."""
     switched = 0
     for i in env_ids:
-        switched += land(i, data)
+        if land(i, data):
+            switched += 1
+        else:
+            finish(i, data)
     return switched
 
 
@@ -192,6 +195,24 @@ def finish_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish(i, data)
+
+
+@compiled
+def align_all(env_ids: np.ndarray, tracks: np.ndarray, data: FootstepData) -> None:
+    """Aligns tracks of the reference (m,) with position and heading of the characters."""
+    tracking, state = data.tracking, data.state
+    table, columns = tracking.comparison.tracks, tracking.comparison.columns
+    for k in range(len(env_ids)):
+        i = env_ids[k]
+        state.track[i] = tracks[k]
+        row, fraction = moment(step_phase(tracking.clock.phase[i]), tracks[k], table)
+        turned = tracking.measurement.heading[i] - feature(row, fraction, columns.heading, table)
+        x = feature(row, fraction, columns.root, table)
+        y = feature(row, fraction, columns.root + 1, table)
+        cosine, sine = math.cos(turned), math.sin(turned)
+        state.turned[i] = turned
+        state.shift[i, 0] = tracking.measurement.root[i, 0] - (cosine * x - sine * y)
+        state.shift[i, 1] = tracking.measurement.root[i, 1] - (sine * x + cosine * y)
 
 
 @compiled

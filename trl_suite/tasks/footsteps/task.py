@@ -47,6 +47,7 @@ from trl_suite.tasks.footsteps.rules import (
     TERMS,
     FootstepData,
     FootstepState,
+    align_all,
     finish_all,
     land_all,
     observe_all,
@@ -172,7 +173,7 @@ class Footsteps(Planned, TrackingTask):
             for i in env_ids.tolist():
                 state.push_begin[i] = self._steps_within(i, self.pushes.interval)
         self._planner.begin(env_ids, self.travel.origin[env_ids], measurement)
-        self._put_reference(env_ids, measurement, self._first_tracks(env_ids))
+        align_all(env_ids, self._first_tracks(env_ids), self._pack)
 
     def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
         return round(self._random[i].uniform(*seconds) / self.control_timestep)
@@ -192,26 +193,13 @@ class Footsteps(Planned, TrackingTask):
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
             self._planner.replan(switched, measurement)
-            self._put_reference(switched, measurement, self._choose(switched, measurement))
-        finish_all(env_ids, self._pack)
+            align_all(switched, self._choose(switched, measurement), self._pack)
+            finish_all(switched, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
         self.figure.measure(env_ids)
         observe_all(env_ids, self._pack)
-
-    def _put_reference(
-        self, env_ids: np.ndarray, measurement: Measurement, tracks: np.ndarray
-    ) -> None:
-        """Aligns tracks (m,) with position and heading of the characters."""
-        state, columns = self.state, self.reference.columns
-        state.track[env_ids] = tracks
-        now = self.reference.features(self.step_phase[env_ids], tracks)
-        turned = measurement.heading[env_ids] - now[:, columns['heading'].start]
-        state.turned[env_ids] = turned
-        state.shift[env_ids] = measurement.root[env_ids, :2] - quaternion.rotate_xy(
-            now[:, columns['root']], turned
-        )
 
 
 class SpatialFootsteps(Footsteps):
