@@ -6,6 +6,7 @@ import io
 import itertools
 import json
 import os
+import pathlib
 import zipfile
 from unittest import mock
 
@@ -492,6 +493,9 @@ class FileTest(FolderTest):
             arrays = dict(data)
         layers = (f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))
         self.assertCountEqual(arrays, {*files._FIELDS, *layers})
+        page = (pathlib.Path(__file__).parents[1] / 'trained/README.md').read_text()
+        for name in (*files._FIELDS, *files._OPTIONAL, *files._LINE, *files._LINE_OPTIONAL):
+            self.assertIn(f'`{name}`', page)
         self.assertEqual((str(arrays['format']), int(arrays['version'])), ('trl_suite policy', 1))
         self.assertEqual(json.loads(str(arrays['info'])), make().info)
         for name, array in arrays.items():

@@ -192,14 +192,10 @@ def _euler(order: str, angles: np.ndarray, intrinsic: bool) -> np.ndarray:
 
     Intrinsic rotations are about body axes, the others about fixed ones.
     """
-    result = np.tile([1.0, 0.0, 0.0, 0.0], (len(angles), 1))
-    for axis, angle in zip(order.lower(), angles.T, strict=True):
-        turn = np.concatenate(
-            [np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * _AXES[axis]], axis=1
-        )
-        pair = (result, turn) if intrinsic else (turn, result)
-        result = quaternion.multiply(*pair)
-    return result
+    from scipy.spatial.transform import Rotation  # takes time, and few programs need it
+
+    turns = Rotation.from_euler(order.upper() if intrinsic else order.lower(), angles)
+    return np.roll(turns.as_quat(), 1, axis=-1)  # scipy has w last
 
 
 def _capture(

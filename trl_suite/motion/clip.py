@@ -13,7 +13,6 @@ import functools
 import os
 import pathlib
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,16 +25,9 @@ VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
 STEPS_SUFFIX = '_steps'  # suffix of files that contain a step library instead of a clip
 _UNIT_TOLERANCE = 1e-6
 _STRAIGHT = 1e-9  # rad; a cycle with a smaller heading change is straight
-_FIELDS = {  # kinds of their dtypes, and numbers of axes
-    'root': ('U', 0),
-    'times': ('fiu', 1),
-    'poses': ('fiu', 2),
-    'joints': ('U', 1),
-    'sizes': ('iu', 1),
-    'loop': ('b', 0),
-    'description': ('U', 0),
-    'turning': ('b', 0),
-}
+_FIELDS = archive.forms(
+    'root U 0, times fiu 1, poses fiu 2, joints U 1, sizes iu 1, loop b 0, description U 0, turning b 0'
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -210,11 +202,7 @@ class Clip:
         return cycles - np.floor(cycles) if self.loop else np.clip(cycles, 0, 1)
 
     def mirrored(self, pairs: Iterable[tuple[str, str]] | None = None) -> Clip:
-        """Returns the clip with left and right exchanged.
-
-        Hinge angles keep their sign, which is correct for hinges about the lateral axis, the only
-        ones of the shipped characters. Rotations and the path of a free root are reflected in the
-        x-z plane.
+        """Returns the clip with left and right exchanged; see `Mirror`.
 
         Args:
           pairs: names of joints to swap, (right, left) in either order. Other joints keep their
@@ -245,13 +233,8 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
     path = shipped(path_or_name, 'clip', names())
     arrays = archive.arrays(path, 'clip')
     arrays.setdefault('turning', np.array(False))
-    try:
-        fields: dict[str, Any] = {
-            name: archive.take(arrays, name, *form) for name, form in _FIELDS.items()
-        }
-        return Clip(path.stem, **fields)
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
+    with errors.naming(path):
+        return Clip(path.stem, **archive.fields(arrays, _FIELDS))
 
 
 def names() -> list[str]:

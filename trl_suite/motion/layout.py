@@ -33,13 +33,7 @@ class Layout:
     """
 
     def __init__(self, root: str, joints: Sequence[str], sizes: Sequence[int]) -> None:
-        """Assigns the columns.
-
-        Args:
-          root: 'planar' or 'free'.
-          joints: joint names in the character's link order.
-          sizes: columns of each in a pose, 1 (hinge) or 4 (ball).
-        """
+        """Assigns the columns; `sizes` are those of joints in a pose, 1 (hinge) or 4 (ball)."""
         if root not in ROOT_SIZES:
             raise ValueError(f'root: {errors.unknown("root", root, ROOT_SIZES)}')
         if len(set(joints)) != len(joints):
@@ -90,6 +84,15 @@ class Layout:
             change[..., self._turns] = quaternion.rotation_vector(turn)
         return change
 
+    def changed(self, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Returns poses (..., columns) after a `change` (..., rates)."""
+        result = poses.copy()
+        result[..., self._straight] += change[..., self._straight_rates]
+        if self.rotations:
+            here, turn = self._quaternions, quaternion.from_vector(change[..., self._turns])
+            result[..., here] = quaternion.multiply(poses[..., here], turn)
+        return result
+
     @functools.cached_property
     def mirror(self) -> Mirror:
         """The exchange of left and right by joint names: right_x for left_x."""
@@ -118,13 +121,7 @@ class Mirror:
     """
 
     def __init__(self, layout: Layout, pairs: Iterable[tuple[str, str]]) -> None:
-        """Prepares the exchange.
-
-        Args:
-          layout: layout of the poses and velocities.
-          pairs: names of joints to swap, (right, left) in either order. Other joints keep their
-            columns.
-        """
+        """Prepares the exchange of pairs of joints, in either order; others keep their columns."""
         self._pose_source, self._rate_source = np.arange(layout.columns), np.arange(layout.rates)
         self._pose_sign, self._rate_sign = np.ones(layout.columns), np.ones(layout.rates)
         if layout.root == 'free':

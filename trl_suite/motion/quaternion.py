@@ -14,13 +14,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def slerp(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Interpolates along the shorter arc from `a` (u = 0) to `b` (u = 1); normalised.
-
-    Args:
-      a: shape (..., 4).
-      b: shape (..., 4).
-      u: interpolation parameters, shape (...).
-    """
+    """Interpolates along the shorter arc from `a` to `b`, (..., 4), with u (...) from 0 to 1."""
     b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -b, b)
     # Twice the half-angle between the 4-vectors; unlike arccos exact for small angles.
     angle = 2 * np.arctan2(np.linalg.norm(b - a, axis=-1), np.linalg.norm(b + a, axis=-1))

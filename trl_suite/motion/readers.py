@@ -25,6 +25,7 @@ import numpy as np
 
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
+from trl_suite.util import errors
 from trl_suite.util.files import read_json, replacing
 from trl_suite.util.options import checked
 
@@ -42,20 +43,15 @@ _LEG = (('hip', 4), ('knee', 1), ('ankle', 4))
 HUMANOID3D: Mapping[str, int] = {
     'chest': 4,
     'neck': 4,
-    **{f'right_{name}': size for name, size in (*_LEG, *_ARM)},
-    **{f'left_{name}': size for name, size in (*_LEG, *_ARM)},
+    **{f'{side}_{name}': size for side in ('right', 'left') for name, size in (*_LEG, *_ARM)},
 }
 _FORELEG = (('shoulder', 4), ('forearm', 1), ('hand', 4), ('finger', 4))
 _HINDLEG = (('upper_leg', 4), ('leg', 1), ('foot', 4), ('toe', 4))
 DOG3D: Mapping[str, int] = {
-    'spine0': 4,
-    'spine1': 4,
-    'neck': 4,
-    'head': 4,
+    **dict.fromkeys(('spine0', 'spine1', 'neck', 'head'), 4),
     **{f'{side}_{name}': size for side in ('left', 'right') for name, size in _FORELEG},
     **{f'{side}_{name}': size for side in ('left', 'right') for name, size in _HINDLEG},
-    'tail0': 4,
-    'tail1': 4,
+    **dict.fromkeys(('tail0', 'tail1'), 4),
 }
 
 
@@ -305,7 +301,5 @@ def _clip(
         x, y, z = frames[:, 1:4].T
         head = np.column_stack([x, -z, y, _lying(frames[:, 4:8])])
     poses = np.concatenate([head, frames[:, _HEADER:]], axis=1)
-    try:
+    with errors.naming(path):
         return Clip(path.stem, times, poses, root, joints, sizes, loop, f'read from {path.name}')
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None

@@ -17,7 +17,6 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,16 +34,10 @@ FEATURES = (
 )  # m, m, m, m, m, m, rad; for a walker in right stance
 WEIGHTS = (0.0, 0.0, 0.0, 0.0, 0.54, 0.54, 0.48)  # of the features, 1/m and 1/rad
 _REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # signs of features in left stance
-_FIELDS = {  # kinds of their dtypes, and numbers of axes
-    'labels': ('fiu', 2),
-    'times': ('fiu', 1),
-    'poses': ('fiu', 3),
-    'joints': ('U', 1),
-    'sizes': ('iu', 1),
-    'previous': ('fiu', 2),
-    'features': ('fiu', 2),
-    'description': ('U', 0),
-}
+_FIELDS = archive.forms(
+    'labels fiu 2, times fiu 1, poses fiu 3, joints U 1, sizes iu 1, previous fiu 2, features fiu 2, '
+    'description U 0'
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -157,13 +150,11 @@ class FootstepLibrary:
     def select(self, query: np.ndarray, weights: ArrayLike = WEIGHTS) -> np.ndarray:
         """Returns the clip nearest to each query.
 
+        Distance is the norm of the weighted difference of features.
+
         Args:
           query: features of the current state and the plan, shape (n, 7); see `features`.
-          weights: weights of the features, shape (7,). Distance is the norm of the weighted
-            difference.
-
-        Returns:
-          Indices, shape (n,).
+          weights: weights of the features, shape (7,).
         """
         gap = (query[:, None] - self.features) * np.asarray(weights)
         return np.argmin((gap * gap).sum(axis=2), axis=1)
@@ -221,13 +212,9 @@ def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
     """
     path = shipped(path_or_name, 'step library', names(), STEPS_SUFFIX)
     arrays = archive.arrays(path, 'step library')
-    try:
-        fields: dict[str, Any] = {
-            name: archive.take(arrays, name, *form) for name, form in _FIELDS.items()
-        }
-        return FootstepLibrary(path.stem.removesuffix(STEPS_SUFFIX), **fields)
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
+    with errors.naming(path):
+        name = path.stem.removesuffix(STEPS_SUFFIX)
+        return FootstepLibrary(name, **archive.fields(arrays, _FIELDS))
 
 
 def names() -> list[str]:

@@ -24,14 +24,7 @@ def stack(name: str, weight: Any, axes: int) -> tuple[int, ...]:
 
 
 def columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
-    """Returns a read-only copy of indices of columns, at least one.
-
-    Args:
-      name: name of the field.
-      value: the indices.
-      axes: number of axes of the array.
-      inputs: number of columns.
-    """
+    """Returns a read-only copy of indices of columns below `inputs`, at least one."""
     copied = np.array(value)
     if copied.ndim != axes or copied.dtype.kind not in 'iu' or not copied.size:
         raise ValueError(f'{name}: expected integers, at least one')

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -45,9 +44,7 @@ class Convolution:
     outputs: int = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
+        put = functools.partial(object.__setattr__, self)
         put('line', int(self.line))
         put('strides', tuple(map(int, self.strides)))
         layers = len(self.strides)

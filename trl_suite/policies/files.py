@@ -9,78 +9,7 @@
     while not time_step.last():
         time_step = environment.step(policy(time_step.observation))
 
-A file holds these arrays and no pickled objects (U is text, a the number of actions, k the number
-of observations, L the number of layers, c the number of inputs of the network: k, unless there are
-`places` or `columns`):
-
-    format       U ()        'trl_suite policy'
-    version      int ()      1
-    id           U ()        environment in which the policy was trained
-    block_names  U (B,)      observation blocks in order
-    block_sizes  int (B,)    numbers in each; they sum to k
-    actions      U (a,)      names of the actions in order
-    quantity     U ()        quantity that an action controls, e.g. 'target angle'
-    mean, std    float (c,)  normalisation: (observation - mean) / std
-    clip         float ()    bound of the normalised observation
-    activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
-    layers       int ()      L
-    weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
-    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or with choices
-                             b, b + a or b + b a
-    log_std      float (a,)  logarithm of the exploration noise's standard deviation
-    info         U ()        a JSON object: how the policy was trained; 'mujoco' and 'cpu' say with what
-                             version and on what class of processor
-
-and, if the policy maps left stance to right stance by reflection (see `trl_suite.policies.mirror`):
-
-    mirror_phase              int ()    column of the phase; or
-    mirror_feet               int (2,)  columns of the right and the left foot's forward position
-    mirror_observation_index  int (k,)  source column of each column of a reflected observation
-    mirror_observation_sign   float (k,)
-    mirror_action_index       int (a,)
-    mirror_action_sign        float (a,)
-
-and, if the network has additional Cartesian inputs for p places that are observed as bearing and
-distance:
-
-    places       int (p, 2)  columns of the bearing, rad, and the distance, m, after reflection, if any;
-                             `placed` appends the additional inputs
-
-and, if the network uses only some columns, e.g. the near part of a height map:
-
-    columns      int (c,)    of the observation, after reflection, and with the 2p numbers of places
-
-and, if it selects one of b actions, as mixtures of experts do:
-
-    choices      float (b, a)  the action is the row whose output is the largest, of the first b; if
-                               there are a more, they are added, or if there are b a more, row by
-                               row, those of this row, and the sum is clipped to [-1, 1]
-    largest_change  float ()   optional: what is added is this times the tanh of these outputs
-
-and, if the first l inputs form a line, e.g. of ground heights, or maps, to which C convolutions are
-applied; their outputs, position by position, and then the other c - l inputs are the inputs of
-layer 0:
-
-    line           int ()    l
-    grid           int (2,)  rows and columns of the maps, which follow each other, row by row; absent
-                             for a line
-    strides        int (C,)  of each layer
-    filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters), for maps (height,
-                             width, channels, filters); the channel of the first is the line, or the
-                             channels are the maps; window (positions, channels) @ filter
-    filter_bias_0  float     (filters,); the activation is that of the hidden layers
-    origin         int ()    optional: index of the input that is subtracted from each input of
-                             the line before the normalisation, such as the height of the root
-
-and, if hidden layers have layer normalisation before the activation: mean 0 and standard deviation
-1 over the layer's outputs, with 1e-5 added to the variance:
-
-    layer_norm   int ()      1
-
-An ensemble of m networks, whose outputs are averaged, has a first axis of m in all of its `weight`,
-`bias`, `filter` and `filter_bias` arrays.
-
-Floats are written as float32, or as float16 if that is exact.
+`trained/README.md` lists the arrays of a file.
 """
 
 from __future__ import annotations
@@ -107,28 +36,17 @@ SHARED = 'shared.json'  # in trained/; see its README
 # Folders in trained/, with other policies of some environments.
 VARIANTS = 'randomized', 'generalist'
 VERSION = 1
-# Key in the file -> dtype kinds, number of axes.
-_FIELDS = {
-    'format': ('U', 0), 'version': ('iu', 0), 'id': ('U', 0), 'block_names': ('U', 1),
-    'block_sizes': ('iu', 1), 'actions': ('U', 1), 'quantity': ('U', 0), 'mean': ('f', 1), 'std': ('f', 1),
-    'clip': ('f', 0), 'activation': ('U', 0), 'layers': ('iu', 0), 'log_std': ('f', 1),
-    'info': ('U', 0),
-}  # fmt: skip
-_MIRROR = {
-    'observation_index': ('iu', 1),
-    'observation_sign': ('f', 1),
-    'action_index': ('iu', 1),
-    'action_sign': ('f', 1),
-}
-_SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
-_OPTIONAL = {
-    'places': ('iu', 2),
-    'columns': ('iu', 1),
-    'choices': ('f', 2),
-    'largest_change': ('f', 0),
-}
-_LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
-_LINE_OPTIONAL = {'origin': ('iu', 0), 'grid': ('iu', 1)}
+_FIELDS = archive.forms(
+    'format U 0, version iu 0, id U 0, block_names U 1, block_sizes iu 1, actions U 1, quantity U 0, '
+    'mean f 1, std f 1, clip f 0, activation U 0, layers iu 0, log_std f 1, info U 0'
+)
+_MIRROR = archive.forms(
+    'observation_index iu 1, observation_sign f 1, action_index iu 1, action_sign f 1'
+)
+_SIDES = archive.forms('phase iu 0, feet iu 1')  # one of them
+_OPTIONAL = archive.forms('places iu 2, columns iu 1, choices f 2, largest_change f 0')
+_LINE = archive.forms('line iu 0, strides iu 1')
+_LINE_OPTIONAL = archive.forms('origin iu 0, grid iu 1')
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
@@ -138,22 +56,10 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
       ValueError: another suffix.
       OSError: the file cannot be written.
     """
-    fields: dict[str, Any] = {
-        'format': FORMAT,
-        'version': VERSION,
-        'id': policy.id,
-        'block_names': [name for name, _ in policy.blocks],
-        'block_sizes': [size for _, size in policy.blocks],
-        'actions': policy.actions,
-        'quantity': policy.quantity,
-        'mean': policy.mean,
-        'std': policy.std,
-        'clip': np.float32(policy.clip),
-        'activation': policy.activation,
-        'layers': len(policy.weights),
-        'log_std': policy.log_std,
-        'info': json.dumps(policy.info),
-    }
+    fields = {name: getattr(policy, name, None) for name in _FIELDS}
+    fields['block_names'], fields['block_sizes'] = zip(*policy.blocks, strict=True)
+    fields |= {'format': FORMAT, 'version': VERSION, 'clip': np.float32(policy.clip)}
+    fields |= {'layers': len(policy.weights), 'info': json.dumps(policy.info)}
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         fields[f'weight_{i}'], fields[f'bias_{i}'] = weight, bias
     if policy.mirror is not None:
@@ -187,10 +93,8 @@ def load(path: str | os.PathLike[str]) -> Policy:
     """
     path = existing(path, ('.npz',))
     arrays = archive.arrays(path, 'policy')
-    try:
+    with errors.naming(path, Exception):  # wrong numbers raise others than ValueError
         return _policy(arrays)
-    except Exception as error:  # wrong numbers do, too
-        raise ValueError(f'{path}: {error}') from None
 
 
 def _policy(arrays: dict[str, np.ndarray]) -> Policy:
@@ -225,10 +129,8 @@ def _policy(arrays: dict[str, np.ndarray]) -> Policy:
             raise ValueError(f"field 'layer_norm': is {fields['layer_norm']}; expected 1")
     for name in _OPTIONAL.keys() & arrays.keys():
         fields[name] = take(arrays, name, *_OPTIONAL[name])
-    try:
+    with errors.naming("field 'info'", (ValueError, RecursionError)):
         fields['info'] = json.loads(fields['info'])
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"field 'info': {error}") from None
     for name in sorted(arrays):
         if name.partition('_')[0] not in ('weight', 'bias'):
             raise ValueError(f'field {name!r}: is unknown')

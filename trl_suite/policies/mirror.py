@@ -96,14 +96,9 @@ def exchanged(count: int, pairs: list[tuple[int, int]]) -> np.ndarray:
 
 
 def blocks(index: np.ndarray, signs: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns index and sign of columns that form blocks of equal size.
+    """Returns index and sign, (b * c,), of columns that form blocks of equal size.
 
-    Args:
-      index: source block of each block, (b,).
-      signs: signs of the columns of a block, c of them.
-
-    Returns:
-      Index and sign, both (b * c,).
+    `index` is the source block of each block, (b,); `signs` are those of the c columns of a block.
     """
     width = len(signs)
     return (index[:, None] * width + np.arange(width)).ravel(), np.tile(signs, len(index))

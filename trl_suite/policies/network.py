@@ -87,9 +87,7 @@ class Policy:
     layer_norm: bool = False
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
+        put = functools.partial(object.__setattr__, self)
         put('id', str(self.id))
         put('blocks', tuple((str(name), int(size)) for name, size in self.blocks))
         put('actions', tuple(map(str, self.actions)))

@@ -31,59 +31,42 @@ KINDS = ('joint limit', 'penetration', 'foot slide')
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One fault in one frame.
+    """One fault in one frame."""
 
-    Attributes:
-      frame: its index, from 0.
-      time: time of the frame, s.
-      kind: one of `KINDS`.
-      name: name of the joint or link.
-      amount: excess over a limit, depth below the ground, or sliding distance.
-      unit: unit of the amount.
-    """
-
-    frame: int
-    time: float
-    kind: str
-    name: str
-    amount: float
+    frame: int  # from 0
+    time: float  # of the frame, s
+    kind: str  # one of `KINDS`
+    name: str  # of the joint or link
+    amount: float  # excess over a limit, depth below the ground, or sliding distance
     unit: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Report:
-    """Measurements in n frames.
+    """Measurements in n frames; arrays are (n,), and 0 where there is no fault."""
 
-    Attributes:
-      name: name of the clip.
-      times: times of the frames, s, (n,).
-      excess: by joint, rad beyond the limits (m for a slide), 0 within them, (n,).
-      units: units of every joint's excess, 'rad' or 'm'.
-      depth: by link, m of its lowest corner below the ground, 0 above it, (n,).
-      slide: by foot, distance in m of a corner in contact from the place where its contact began,
-        the largest of all corners, 0 without contact, (n,).
-    """
-
-    name: str
-    times: np.ndarray
-    excess: dict[str, np.ndarray]
-    units: dict[str, str]
-    depth: dict[str, np.ndarray]
-    slide: dict[str, np.ndarray]
+    name: str  # of the clip
+    times: np.ndarray  # of the frames, s
+    excess: dict[str, np.ndarray]  # by joint, rad beyond the limits (m for a slide)
+    units: dict[str, str]  # of every joint's excess, 'rad' or 'm'
+    depth: dict[str, np.ndarray]  # by link, m of its lowest corner below the ground
+    slide: dict[str, np.ndarray]  # by foot, m of a corner since its contact began, the largest
 
     @functools.cached_property
     def faults(self) -> tuple[Fault, ...]:
         """All faults, frame by frame."""
-        parts = (self.excess, EXCESS), (self.depth, DEPTH), (self.slide, SLIDE)
+        parts: tuple[tuple[dict[str, np.ndarray], float, dict[str, str]], ...] = (
+            (self.excess, EXCESS, self.units),
+            (self.depth, DEPTH, {}),
+            (self.slide, SLIDE, {}),
+        )
+        times = self.times.tolist()
         found = [
-            Fault(
-                int(i), float(self.times[i]), kind, name, float(values[i]),
-                self.units[name] if measured is self.excess else 'm',
-            )
-            for kind, (measured, most) in zip(KINDS, parts, strict=True)
+            Fault(i, times[i], kind, name, float(values[i]), units.get(name, 'm'))
+            for kind, (measured, most, units) in zip(KINDS, parts, strict=True)
             for name, values in measured.items()
-            for i in np.flatnonzero(values > most)
-        ]  # fmt: skip
+            for i in np.flatnonzero(values > most).tolist()
+        ]
         return tuple(sorted(found, key=lambda fault: fault.frame))
 
     def __str__(self) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from trl_suite.motion import Clip, quaternion
+from trl_suite.motion import Clip
 
 CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
 CYCLE_FRAMES = 300  # largest number of frames in the search for a cycle
@@ -42,24 +42,9 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
     layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
     gap = layout.change(poses[-1], poses[0])
     gap[:flat] = 0.0
-    poses = _advanced(clip, poses, share[:, None] * gap)
+    poses = layout.changed(poses, share[:, None] * gap)
     poses[:, :flat] -= poses[0, :flat].copy()
     return dataclasses.replace(clip, times=share * (end - start), poses=poses, loop=True)
-
-
-def _advanced(clip: Clip, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Returns poses (n, columns) after changes (n, rates), in a clip's layout."""
-    layout = clip.layout
-    result = poses.copy()
-    quaternions = [column for q, _ in layout.rotations for column in range(q, q + 4)]
-    turns = [column for _, v in layout.rotations for column in range(v, v + 3)]
-    result[:, np.setdiff1d(np.arange(layout.columns), quaternions)] += change[
-        :, np.setdiff1d(np.arange(layout.rates), turns)
-    ]
-    for q, v in layout.rotations:
-        turn = quaternion.from_vector(change[:, v : v + 3])
-        result[:, q : q + 4] = quaternion.multiply(poses[:, q : q + 4], turn)
-    return result
 
 
 def _alike(clip: Clip) -> tuple[float, float]:

@@ -44,9 +44,7 @@ NAMES: dict[str, tuple[str, ...]] = {
 def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
     """Returns a map from joints of a character to joints of a motion, by usual names (`NAMES`).
 
-    Args:
-      theirs: joints of the motion.
-      ours: joints of the character. Those without a counterpart are omitted.
+    Joints of the character without a counterpart are omitted.
     """
     known = {name.rpartition(':')[2].lower().replace(' ', ''): name for name in theirs}
     found = {}
@@ -66,10 +64,7 @@ def counterparts(
 ) -> dict[str, str]:
     """Returns the map from root and joints of a character to joints of a motion.
 
-    Args:
-      motion: the motion.
-      joints: joints of the character.
-      joint_map: from the character's joints, and 'root', to the motion's; by default `guess_map`.
+    It is the given one, by default that of `guess_map`.
     """
     ours, theirs = ('root', *joints), _joints(motion)
     chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)
@@ -224,13 +219,8 @@ def _poses(
 ) -> np.ndarray:
     """Returns poses in the character's layout, (n, columns).
 
-    Args:
-      figure: the character.
-      motion: source of joint rotations, if it is a clip.
-      chosen: the joint map.
-      path: path of the root, (n, 3).
-      turns: rotations of the root, (n, 4).
-      links: target orientations of links, for a capture; None for a clip.
+    The root has the positions `path`, (n, 3), and the rotations `turns`, (n, 4). Joints follow
+    those of a clip, or for a capture the target orientations of links.
     """
     layout, n = figure.layout, len(path)
     poses = np.zeros((n, layout.columns))

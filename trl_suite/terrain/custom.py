@@ -39,9 +39,8 @@ from trl_suite.util.libraries import library
 from trl_suite.util.options import checked
 
 FARTHEST = 1e6  # m; of a vertex of a mesh
-IMAGES = {  # with the names of their formats in Pillow
-    '.png': 'PNG', '.tif': 'TIFF', '.tiff': 'TIFF', '.bmp': 'BMP', '.jpg': 'JPEG', '.jpeg': 'JPEG',
-}  # fmt: skip
+_FORMATS = {'PNG': '.png', 'TIFF': '.tif .tiff', 'BMP': '.bmp', 'JPEG': '.jpg .jpeg'}  # of Pillow
+IMAGES = {suffix: kind for kind, suffixes in _FORMATS.items() for suffix in suffixes.split()}
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
 
 HeightFunction = Callable[..., npt.ArrayLike]
@@ -355,10 +354,8 @@ def from_mesh(
             f'expected 2 or more along each axis and no more than {LARGEST:g} in all'
         )
     x, y = (spacing * (first[i] + np.arange(count[i])) for i in (0, 1))
-    try:
+    with errors.naming(file):
         heights = mesh.heights_over(triangles, x, y)
-    except ValueError as error:
-        raise ValueError(f'{file}: {error}') from None
     heights[np.isinf(heights)] = low[2]
     corner = int(first[0]), int(first[1])
     return from_heights(heights, spacing, file.stem, first=corner, line=line, start_span=start_span)

@@ -29,13 +29,7 @@ key, if it has
 
 The presets are the original's terrain files under their original names (planar ones in PRESETS,
 three-dimensional ones in PRESETS3D), and `mixed_humanoid`, which is `slopes_mixed_humanoid` without
-its slopes. They differ from the original's files as follows:
-* `gaps_humanoid` (GapH) and `cliffs_humanoid` (StepH1) have their reversed ranges in ascending
-  order, which is the same distribution;
-* `mixed_curriculum` intends steps of 0.05 to 0.1 m in its first set, but its file spells the names
-  without the 0, so that the original used the default 0.1 to 0.4 m; here the intended values apply;
-* entries without effect are omitted: bumps and slopes of `cliffs_rugged`, everything but gaps in
-  `test_terrain`, lengths of legs of trails, slices of belts, spacings of stairs.
+its slopes. Entries without effect are omitted; `docs/differences.md` has the other differences.
 """
 
 from __future__ import annotations
@@ -156,16 +150,19 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     kind = content['Type']
     if kind not in GENERATORS and f'{_PREFIX}{kind}' in GENERATORS:  # a file of DeepTerrainRL
         kind = f'{_PREFIX}{kind}'
-        sets = [
-            {key: value for key, value in each.items() if key not in _OVERLAYS or value}
-            if kind == 'var2d_cliffs' and isinstance(each, Mapping) else each
-            for each in sets
-        ]  # fmt: skip
+        if kind == 'var2d_cliffs':
+            sets = [_without_overlays(each) for each in sets]
     for key in [key for key in _UNUSED if key in content]:
         value = checked(f'{name}: {key}', content[key], float)
         if kind in GENERATORS3D and key != 'GroundWidth' and value != GRID:
             raise ValueError(f'{name}: {key} must be {GRID:g} m, not {value!r}')
     return Terrain(name, kind, tuple(sets))
+
+
+def _without_overlays(values: Any) -> Any:
+    if not isinstance(values, Mapping):
+        return values  # an error, see `Terrain`
+    return {key: value for key, value in values.items() if key not in _OVERLAYS or value}
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

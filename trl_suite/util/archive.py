@@ -19,6 +19,15 @@ def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
+Forms = dict[str, tuple[str, int]]  # by field: the kinds of dtypes, and the number of axes
+
+
+def forms(text: str) -> Forms:
+    """Returns the forms of fields from text, e.g. 'times fiu 1, joints U 1'."""
+    parts = (part.split() for part in text.split(','))
+    return {name: (kinds, int(axes)) for name, kinds, axes in parts}
+
+
 def arrays(path: pathlib.Path, what: str) -> dict[str, np.ndarray]:
     """Returns the arrays of an archive by name; `what` is what it should contain, for messages.
 
@@ -48,3 +57,8 @@ def take(found: dict[str, np.ndarray], name: str, kinds: str, axes: int) -> np.n
     if array.dtype.kind not in kinds or array.ndim != axes:
         raise ValueError(f'field {name!r}: has type {array.dtype} and {array.ndim} axes')
     return array
+
+
+def fields(found: dict[str, np.ndarray], wanted: Forms) -> dict[str, Any]:
+    """Takes out the arrays of fields, by name."""
+    return {name: take(found, name, *form) for name, form in wanted.items()}

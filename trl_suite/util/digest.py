@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 _CONSTANTS = (
-    bool, int, float, str, bytes, tuple, np.generic, np.ndarray, type, types.FunctionType,
-    types.MethodType, functools.partial, pathlib.PurePath,
-)  # fmt: skip
+    *(bool, int, float, str, bytes, tuple, np.generic, np.ndarray, type, pathlib.PurePath),
+    *(types.FunctionType, types.MethodType, functools.partial),
+)
 
 
 def digest(value: Any, without: Collection[str] = ()) -> str:
@@ -26,9 +26,7 @@ def digest(value: Any, without: Collection[str] = ()) -> str:
     dataclasses; name, bytecode, defaults and closure of functions, but neither the globals that they
     use nor what may change in their closure, such as lists; and of any other object only its class.
 
-    Args:
-      value: the value.
-      without: names of fields of dataclasses that do not count.
+    Fields of dataclasses whose names are in `without` do not count.
     """
     parts: list[bytes] = []
     _add(value, parts, without, ())

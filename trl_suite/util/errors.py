@@ -1,9 +1,10 @@
 """Messages for invalid input: the value, what was expected, and the nearest valid choice."""
 
+import contextlib
 import difflib
 import math
 import numbers
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,17 @@ def check_known(kind: str, choices: Iterable[str], *names: Any) -> None:
             raise ValueError(unknown(kind, name, known))
 
 
+@contextlib.contextmanager
+def naming(
+    what: object, kinds: type[Exception] | tuple[type[Exception], ...] = ValueError
+) -> Iterator[None]:
+    """Makes errors of some kinds ValueErrors whose messages begin with `what`, e.g. a file."""
+    try:
+        yield
+    except kinds as error:
+        raise ValueError(f'{what}: {error}') from None
+
+
 def _listed(names: list[str]) -> str:
     if len(names) <= MANY:
         return ', '.join(names)
@@ -55,9 +67,13 @@ def is_number(value: object) -> bool:
 
 
 def floats(
-    name: str, value: Any, shape: tuple[int, ...] | None = None, most: float = math.inf,
-    dtype: Any = float, missing: bool = False,
-) -> np.ndarray:  # fmt: skip
+    name: str,
+    value: Any,
+    shape: tuple[int, ...] | None = None,
+    most: float = math.inf,
+    dtype: Any = float,
+    missing: bool = False,
+) -> np.ndarray:
     """Returns a read-only copy of an array of finite numbers.
 
     Args:
@@ -88,12 +104,7 @@ def floats(
 
 
 def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Returns a copy of a mapping of options; an empty dict for None.
-
-    Args:
-      name: name of the argument that holds them.
-      value: the options by name, or None.
-    """
+    """Returns a copy of a mapping of options; an empty dict for None. `name` is the argument's."""
     if value is not None and not isinstance(value, Mapping):
         raise TypeError(f'{name} is {value!r}; expected a dict of options by name')
     return dict(value or {})

@@ -17,11 +17,9 @@ from typing import Any
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # Windows has none
-    fcntl = None  # type: ignore[assignment]
+from trl_suite.util.libraries import optional
 
+fcntl = optional('fcntl')  # Windows has none
 Path = str | os.PathLike[str]
 LARGEST = 2**28  # bytes of a file, or of the arrays of an archive, 268 MB
 MOST_EMPTY = 10**6  # elements of an array without content
@@ -91,13 +89,7 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
 
 
 def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> None:
-    """Checks a file before it is read.
-
-    Args:
-      path: path of the file.
-      largest: largest allowed size, bytes.
-      size: size of the content, bytes, if it differs from that of the file.
-    """
+    """Checks a file before it is read: its size, or that of its content if it differs, bytes."""
     if size is None:
         size = pathlib.Path(path).stat().st_size
         _check_regular(pathlib.Path(path))
@@ -110,14 +102,8 @@ def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> N
 def check_own(path: Path, status: os.stat_result) -> None:
     """Checks that no other user can have written a file, or to a folder.
 
-    Nothing is checked on systems without user ids, such as Windows.
-
-    Args:
-      path: for the message.
-      status: of the file or folder.
-
-    Raises:
-      PermissionError: it belongs to another user, or others can write it.
+    Nothing is checked on systems without user ids, such as Windows. `path` is for the message of
+    the PermissionError.
     """
     if not hasattr(os, 'geteuid'):
         return
@@ -178,12 +164,7 @@ def read_text(path: Path) -> str:
 def read_json(
     path: Path, object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None
 ) -> Any:
-    """Returns the content of a JSON file.
-
-    Args:
-      path: path of the file.
-      object_pairs_hook: as for `json.loads`; a ValueError that it raises names the file.
-    """
+    """Returns the content of a JSON file; errors of the hook, see `json.loads`, name the file."""
     text = read_text(path)
     try:
         return json.loads(text, object_pairs_hook=object_pairs_hook)

@@ -16,6 +16,14 @@ def missing(package: str, source: str) -> str:
     return f'{package} is required but not installed; pip install {quoted}'
 
 
+def optional(name: str) -> Any:
+    """Returns a module that some systems lack; None if it cannot be imported."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
 def library(name: str, source: str) -> Any:
     """Imports a module of a library.
 

@@ -14,11 +14,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-try:
-    import resource
-except ImportError:  # Windows has none
-    resource = None  # type: ignore[assignment]
+from trl_suite.util.libraries import optional
 
+resource = optional('resource')  # Windows has none
 SECONDS = 10  # of processor time, not on Windows
 MEMORY = 2 * 10**9  # bytes in addition to those of imported libraries, on Linux
 WAIT = 60.0  # s of real time, e.g. for a pipe that nobody writes

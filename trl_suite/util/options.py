@@ -28,8 +28,11 @@ import numpy as np
 from trl_suite.util import errors
 
 _COMPARISONS = {
-    'at_least': operator.ge, 'at_most': operator.le, 'above': operator.gt, 'below': operator.lt,
-}  # fmt: skip
+    'at_least': operator.ge,
+    'at_most': operator.le,
+    'above': operator.gt,
+    'below': operator.lt,
+}
 
 
 class Range(NamedTuple):
@@ -43,10 +46,13 @@ _UNFIT = object()  # stands for a value of another type
 _TYPES: dict[Any, Any] = {bool: (bool, np.bool_), str: str, types.NoneType: types.NoneType}
 _SEQUENCES = (list, Sequence, Collection)
 _WORDS: dict[object, tuple[str, str]] = {  # kinds of values, singular and plural
-    bool: ('True or False', 'bools'), int: ('a whole number', 'whole numbers'),
-    float: ('a number', 'numbers'), str: ('a string', 'strings'), types.NoneType: ('None', 'None'),
+    bool: ('True or False', 'bools'),
+    int: ('a whole number', 'whole numbers'),
+    float: ('a number', 'numbers'),
+    str: ('a string', 'strings'),
+    types.NoneType: ('None', 'None'),
     Range: ('a number or a lower and an upper bound', 'ranges'),
-}  # fmt: skip
+}
 
 
 def option(
@@ -70,11 +76,14 @@ def option(
       policy: whether the id of an environment may be given for the policy that is shipped for it.
       **bounds: at_least, at_most, above or below, of every number in the value.
     """
-    metadata = {
-        'meaning': meaning, 'unit': unit, 'bounds': bounds, 'choices': tuple(choices),
-        'actuation': actuation, 'policy': policy,
-    }  # fmt: skip
+    metadata: dict[str, Any] = {'meaning': meaning, 'unit': unit, 'bounds': bounds}
+    metadata |= {'choices': tuple(choices), 'actuation': actuation, 'policy': policy}
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def within(low: float, high: float, unit: str = '') -> dict[str, Any]:
+    """Returns bounds and unit for `option`: every number is from low to high."""
+    return {'at_least': low, 'at_most': high, 'unit': unit}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

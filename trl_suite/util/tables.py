@@ -11,17 +11,11 @@ WIDTH = 100  # characters of a line of text
 
 
 class Table(NamedTuple):
-    """A table with a header.
-
-    Attributes:
-      header: title of each column.
-      cells: rows of numbers and texts.
-      numbered: whether rows are entries of a vector; Markdown then gets a column of indices.
-    """
+    """A table with a header."""
 
     header: Sequence[str]
-    cells: Sequence[Sequence[object]]
-    numbered: bool = False
+    cells: Sequence[Sequence[object]]  # rows of numbers and texts
+    numbered: bool = False  # whether rows are entries of a vector: Markdown then has their indices
 
 
 Part = Table | str  # a str is a paragraph, or a list with an item '- ...' on each line
@@ -73,12 +67,7 @@ def table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str 
 
 
 def markdown_table(table: Table, plain: bool = False) -> str:
-    """Returns a table as Markdown.
-
-    Args:
-      table: the table.
-      plain: whether cells are Markdown, e.g. links, which are not escaped.
-    """
+    """Returns a table as Markdown; cells that are `plain` Markdown, e.g. links, are not escaped."""
     header, rows = list(table.header), [[_cell(c) for c in row] for row in table.cells]
     if table.numbered:
         header, rows = (
