@@ -113,8 +113,11 @@ def read(app: Any, name: str, source: list[str]) -> None:
     def drawn(match: re.Match[str]) -> str:
         return match[0] if os.path.exists(os.path.normpath(own.parent / match[1])) else ''
 
-    text = STRIP.sub(moving, CELL.sub(page_of, LINK.sub(inside, text)))
-    if name.partition('/')[0] in generate.SITE:
+    text = CELL.sub(page_of, LINK.sub(inside, text))
+    folder = name.partition('/')[0]
+    if folder == 'environments':
+        text = STRIP.sub(moving, text)
+    if folder in generate.SITE:
         text = PICTURE.sub(drawn, text)
     source[0] = text + navigation(name)
 

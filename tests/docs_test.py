@@ -384,6 +384,12 @@ class SiteTest(absltest.TestCase):
         dog = '![dog](../pictures/characters/dog.jpg)'
         text = f'a ![b](../pictures/terrains/none.png) {dog}'
         self.assertStartsWith(self.page('terrains/none', text), f'a  {dog}')
+        strip = '| ![Film strip](../pictures/environments/None-v0.jpg) |'
+        view = (
+            'In the [web browser](../guide.md#in-a-web-browser): `trl-suite view None-v0 --browser`'
+        )
+        self.assertEqual(self.page('environments/None-v0', strip), f'| \n\n{view} |')
+        self.assertStartsWith(self.page('families/plaid', strip), '|  |\n')  # within a table
         error, told = RuntimeError('no OpenGL library works'), io.StringIO()
         with (
             mock.patch.object(gallery, 'make', side_effect=error),
