@@ -656,6 +656,12 @@ class SafetyTest(FolderTest):
         with self.spoiled(path, how), self.assertRaises(OSError):
             machine_code._read(path)
 
+    def test_files_with_another_checksum_are_not_loaded(self):
+        path = self.folder / 'code.nbc'
+        path.write_bytes(hashlib.sha256(b'code').digest() + b'coda')
+        with self.assertRaisesRegex(ValueError, 'is damaged'):
+            machine_code._read(path)
+
     def test_unused_code_is_removed_and_nothing_else(self):
         folder = module._made(self.folder)
         kernels, elsewhere = folder.parent, self.folder / 'elsewhere'
@@ -670,8 +676,9 @@ class SafetyTest(FolderTest):
         (old[1] / 'notes.txt').touch()
         old[2].symlink_to(elsewhere)
         old[3].touch()
-        for path in (*old, *kept[:-1]):  # the last one is in use
-            os.utime(path, (0, time.time() - 2 * module.UNUSED))
+        for path in (*old, *kept):
+            unused = 0.9 if path == kept[-1] else 1.1  # the last one is in use
+            os.utime(path, (0, time.time() - unused * module.UNUSED))
         module._made(self.folder)
         self.assertFalse(old[0].exists())
         self.assertEqual([path.name for path in old[1].iterdir()], ['notes.txt'])
