@@ -309,7 +309,7 @@ class TrailTest(parameterized.TestCase):
         ('trail3d_wide', 2, 3, 0.5),
     )  # fmt: skip
     def test_segments(self, source, narrowest, widest, turn):
-        turns, narrow, headings, rises = [], [], [], []
+        turns, shares, headings, rises = [], [], [], []
         for seed in range(30):
             trail = make(source, seed).layout.trail
             trail.extend(200)
@@ -319,13 +319,15 @@ class TrailTest(parameterized.TestCase):
             self.assertBetween(trail.width.min(), narrowest, widest)
             self.assertBetween(trail.width.max(), narrowest, widest)
             turns.append(np.diff(trail.heading)[1:])
-            narrow.append(trail.width[2:] < narrowest + 0.25 * (widest - narrowest))
+            shares.append((trail.width[2:] - narrowest) / max(widest - narrowest, 1e-9))
             headings.append(trail.heading[1:-1])
             rises.append(np.diff(trail.height))
-        turns, narrow, headings, rises = map(np.concatenate, (turns, narrow, headings, rises))
-        self.assertBetween(np.abs(turns[~narrow]).max(), 0.98 * turn, turn)
-        if narrow.any():
-            self.assertBetween(np.abs(turns[narrow]).max(), 0.45 * turn, 0.5 * turn)
+        turns, shares, headings, rises = map(np.concatenate, (turns, shares, headings, rises))
+        if widest > narrowest:  # where it is narrow it turns half as much
+            for low, high, most in ((0, 0.25, 0.5), (0.25, 0.35, 1), (0.35, 1, 1)):
+                some = np.abs(turns[(shares >= low) & (shares < high)]) / turn
+                self.assertBetween(some.max(), 0.95 * most, most)
+        self.assertBetween(np.abs(turns).max(), 0.98 * turn, turn)
         # Straight on is no preferred direction within 1 rad; further off the trail is led back.
         self.assertAlmostEqual((turns > 0).mean(), 0.5, delta=0.03)
         self.assertLess(np.abs(headings).max(), 0.6 * np.pi + turn)
