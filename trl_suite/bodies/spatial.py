@@ -345,7 +345,7 @@ class SpatialBody(Body):
             corners=self._corners(),
         )
         hinges, turning = np.count_nonzero(~ball), 3 + len(ids.turning)
-        self.columns = feature_columns(4 + len(balls), hinges, turning, len(self.effectors))
+        self.columns = feature_columns(4 + len(balls), int(hinges), turning, len(self.effectors))
         ground, using = self.arena.surroundings.arrays, (action_map, observation, observed)
         self._use(SpatialBodyData, ids, SpatialState, ground, *using)
 
