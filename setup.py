@@ -66,6 +66,7 @@ setup(
     include_package_data=False,  # true by default where pyproject.toml has the table `project`
     package_data={
         'trl_suite': ['py.typed'],
+        'trl_suite.actuation': ['*.json'],
         'trl_suite.controllers': ['*.json'],
         'trl_suite.terrain': ['*.json'],
         'trl_suite.xml': ['*.xml'],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,11 @@ _TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
 class ActionMap:
     """The map from an action in [-1, 1] to control: action_offset + action_scale * action.
 
+    Of ball joints, the norm of three torques is then clamped to the torque limit. In position
+    actions of the original, a ball joint has an angle, then an axis of any length, forward, up and
+    right, in place of which the controls have a rotation vector; an axis of length 0 is replaced by
+    the one to the right.
+
     Attributes:
       names: joint or muscle of each action, shape (k,).
       quantity: quantity of the controls, e.g. 'target angle'.
@@ -30,6 +35,8 @@ class ActionMap:
       action_scale: change of control per unit action, shape (k,).
       actuators: names of the actuators that get the controls, in order; those of ball joints get
         three each. Empty if a controller converts the controls.
+      balls: the fields of `Drive` for ball joints: for torques that are clamped, or for angles and
+        axes.
     """
 
     names: tuple[str, ...]
@@ -38,32 +45,50 @@ class ActionMap:
     action_offset: np.ndarray
     action_scale: np.ndarray
     actuators: tuple[str, ...] = ()
+    balls: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def has_axes(self) -> bool:
+        """Whether actions describe rotations of ball joints by angles and axes."""
+        return 'angles' in self.balls
+
     def control(self, action: np.ndarray) -> np.ndarray:
         """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
-        low, high, action_scale, action_offset = self._rows
-        control = np.maximum(action, low)  # contiguous arrays: faster than scalars
-        np.minimum(control, high, out=control)
-        control *= action_scale
-        control += action_offset
-        return control if np.ndim(action) > 1 else control[0]
+        by, rows = self.drive(0), np.reshape(action, (-1, len(self))).astype(float)
+        found = np.empty((len(rows), len(self) - len(self.balls.get('angles', ()))))
+        for i in range(len(rows)):
+            drive(i, rows, by, found)
+        return found.reshape(*np.shape(action)[:-1], -1)
 
     def drive(self, first: int) -> Drive:
         """Returns the map for compiled functions; `first` is the address of the first control."""
         none = np.zeros((0, 3), int), np.zeros(0)
-        return Drive(self.action_offset, self.action_scale, first, *none)
-
-    @functools.cached_property
-    def _rows(self) -> tuple[np.ndarray, ...]:
-        ones = np.ones((1, len(self)))
-        return -ones, ones, self.action_scale[None], self.action_offset[None]
+        balls: Any = self.balls
+        return Drive(self.action_offset, self.action_scale, first, *none)._replace(**balls)
 
     def action(self, control: np.ndarray) -> np.ndarray:
-        """Maps controls (..., k) to the actions that yield them; not clipped."""
+        """Maps controls (..., k) to actions that yield them; not clipped.
+
+        Of the many equivalent angles and axes, it returns those with an axis in [-1, 1].
+        """
+        if self.has_axes:
+            control = self._with_axes(control)
         return (control - self.action_offset) / self.action_scale
+
+    def _with_axes(self, control: np.ndarray) -> np.ndarray:
+        """Returns angles and axes in place of rotation vectors."""
+        angles, (own, others) = self.balls['angles'], self.balls['hinges']
+        vector = control[..., self.balls['angle_balls']]
+        angle = np.linalg.norm(vector, axis=-1)
+        turned = angle[..., None] > 0
+        axis = np.where(turned, vector / np.where(turned, angle[..., None], 1), _TO_THE_RIGHT)
+        value = np.empty((*control.shape[:-1], len(self)))
+        value[..., own], value[..., angles] = control[..., others], angle
+        value[..., angles[:, None] + _FORWARD_LEFT_UP] = axis * _SIGNS * (1 - AXIS_OFFSET)
+        return value
 
     def checked(self, action: npt.ArrayLike, *num_envs: int) -> np.ndarray:
         """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k)."""
@@ -89,26 +114,20 @@ class ActionMap:
 
 
 class Drive(NamedTuple):
-    """An action map for compiled functions; the addresses of its actuators are consecutive.
+    """An action map for compiled functions; the addresses of its actuators are consecutive."""
 
-    Attributes:
-      offset: control at action 0, (k,).
-      scale: change per unit action, (k,).
-      first: address of the first control.
-      torque_balls: indices of the torques of each ball joint, (B, 3), if the map is a `TorqueMap`.
-      torque_limits: largest norm of the torque of each ball joint, (B,), likewise.
-      angles, angle_balls, hinges: fields of an `AngleAxisMap`, (B,), (B, 3) and (2, H); None for
-        another type of map.
-    """
-
-    offset: np.ndarray
-    scale: np.ndarray
-    first: int
-    torque_balls: np.ndarray
-    torque_limits: np.ndarray
-    angles: np.ndarray | None = None
-    angle_balls: np.ndarray | None = None
-    hinges: np.ndarray | None = None
+    offset: np.ndarray  # (k,); control at action 0
+    scale: np.ndarray  # (k,); change per unit action
+    first: int  # address of the first control
+    # Ball joints whose torques are clamped: indices of these, and their largest norm, N m.
+    torque_balls: np.ndarray  # (B, 3)
+    torque_limits: np.ndarray  # (B,)
+    # Ball joints with an angle and an axis, which follows it: index of the angle in an action, and
+    # indices of the rotation vector in the controls; None if actions have no axes.
+    angles: np.ndarray | None = None  # (B,)
+    angle_balls: np.ndarray | None = None  # (B, 3)
+    # Other joints beside these: indices in an action and in the controls.
+    hinges: np.ndarray | None = None  # (2, H)
 
 
 @compiled_inline
@@ -144,7 +163,7 @@ def _drive_rotations(
     balls: np.ndarray | None,
     hinges: np.ndarray | None,
 ) -> bool:
-    """Writes the rotation vectors of ball joints from angles and axes; see `AngleAxisMap`.
+    """Writes the rotation vectors of ball joints from angles and axes; see `ActionMap`.
 
     Returns:
       Whether the actions have these; otherwise, nothing is written, nor compiled.
@@ -167,89 +186,3 @@ def _drive_rotations(
         ctrl[i, by.first + balls[ball, 1]] = y * share
         ctrl[i, by.first + balls[ball, 2]] = z * share
     return True
-
-
-@dataclasses.dataclass(frozen=True)
-class TorqueMap(ActionMap):
-    """Torques of joints, some of them spherical: the norm of these is clamped after the affine map.
-
-    Attributes:
-      balls: indices of the three torques of each ball joint, shape (B, 3).
-      limits: the largest norm of each, N m, shape (B,).
-    """
-
-    balls: np.ndarray = dataclasses.field(kw_only=True)
-    limits: np.ndarray = dataclasses.field(kw_only=True)
-
-    def control(self, action: np.ndarray) -> np.ndarray:
-        control = super().control(action)
-        torque = control.take(self.balls, -1)
-        torque *= (self.limits / np.maximum(_norm(torque), self.limits))[..., None]
-        control[..., self.balls] = torque
-        return control
-
-    def drive(self, first: int) -> Drive:
-        return super().drive(first)._replace(torque_balls=self.balls, torque_limits=self.limits)
-
-
-@dataclasses.dataclass(frozen=True)
-class AngleAxisMap(ActionMap):
-    """The position actions of the original: angle and axis of a rotation for every ball joint.
-
-    The affine map yields an angle, then an axis of any length, forward, up and right; an axis of
-    length 0 is replaced by the one to the right. `control` converts these to rotation vectors, so
-    it returns fewer numbers than it takes, and `action` returns one of many equivalent actions.
-
-    Attributes:
-      angles: index of the angle of each ball joint in an action, shape (B,); its axis follows.
-      balls: indices of its rotation vector in the controls, shape (B, 3).
-      hinges: indices of the other joints in an action and in the controls, shape (2, H).
-    """
-
-    angles: np.ndarray = dataclasses.field(kw_only=True)
-    balls: np.ndarray = dataclasses.field(kw_only=True)
-    hinges: np.ndarray = dataclasses.field(kw_only=True)
-
-    def control(self, action: np.ndarray) -> np.ndarray:
-        value = super().control(action)
-        axis = value.take(self._axes, -1)
-        axis *= _SIGNS
-        length = _norm(axis)
-        if not length.all():
-            axis[length == 0] = _TO_THE_RIGHT
-            length[length == 0] = 1
-        axis *= (value.take(self.angles, -1) / length)[..., None]
-        control = np.empty((*value.shape[:-1], self.balls.size + len(self.hinges[1])))
-        control[..., self.hinges[1]] = value.take(self.hinges[0], -1)
-        control[..., self.balls] = axis
-        return control
-
-    def drive(self, first: int) -> Drive:
-        return (
-            super()
-            .drive(first)
-            ._replace(angles=self.angles, angle_balls=self.balls, hinges=np.asarray(self.hinges))
-        )
-
-    @functools.cached_property
-    def _axes(self) -> np.ndarray:
-        """Indices of forward, left and up in an action, shape (B, 3)."""
-        return self.angles[:, None] + _FORWARD_LEFT_UP
-
-    def action(self, control: np.ndarray) -> np.ndarray:
-        vector = control[..., self.balls]
-        angle = _norm(vector)
-        turned = angle[..., None] > 0
-        axis = np.where(turned, vector / np.where(turned, angle[..., None], 1), _TO_THE_RIGHT)
-        value = np.empty((*control.shape[:-1], len(self)))
-        value[..., self.hinges[0]] = control[..., self.hinges[1]]
-        value[..., self.angles] = angle
-        # Scaled so that every axis has an action in [-1, 1].
-        value[..., self._axes] = axis * _SIGNS * (1 - AXIS_OFFSET)
-        return super().action(value)
-
-
-def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Lengths of vectors (..., 3); bitwise independent of the number of simulations."""
-    square = vectors * vectors
-    return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])

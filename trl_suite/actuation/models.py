@@ -24,9 +24,8 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.actuation import hill
-from trl_suite.actuation import muscles as muscle_tables
-from trl_suite.actuation.action_map import AXIS_OFFSET, ActionMap, AngleAxisMap, TorqueMap
-from trl_suite.actuation.muscles import Muscle
+from trl_suite.actuation.action_map import AXIS_OFFSET, ActionMap
+from trl_suite.actuation.muscles import MUSCLES, PLAIN, Muscle
 from trl_suite.characters.character import Character
 from trl_suite.util import errors
 
@@ -90,6 +89,11 @@ def _balls(character: Character, size: int) -> np.ndarray:
     return (np.cumsum(sizes) - sizes)[ball]
 
 
+def _vectors(character: Character) -> np.ndarray:
+    """Returns the indices of the degrees of freedom of each ball joint, shape (B, 3)."""
+    return _balls(character, 3)[:, None] + np.arange(3)
+
+
 def _dofs(character: Character) -> Iterator[tuple[str, mjcf.Element, dict[str, Any]]]:
     """Yields name and joint of every degree of freedom, and options of its actuator."""
     for name, joint, ball in zip(
@@ -127,12 +131,8 @@ def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap
     names = _split(character, 'xyz')
     scale = _by_type(character, TORQUE_SCALE, FORCE_SCALE)
     unit = _unit(character, 'N m', 'N')
-    affine = names, 'torque', unit, np.zeros(len(names)), scale * each, names
-    ball = character.spherical
-    if not ball.any():
-        return ActionMap(*affine)
-    balls = _balls(character, 3)[:, None] + np.arange(3)
-    return TorqueMap(*affine, balls=balls, limits=limits[ball])
+    balls = {'torque_balls': _vectors(character), 'torque_limits': limits[character.spherical]}
+    return ActionMap(names, 'torque', unit, np.zeros(len(names)), scale * each, names, balls)
 
 
 def _add_velocity(character: Character, timestep: float, **_: object) -> ActionMap:
@@ -220,7 +220,7 @@ def _add_position(
     return ActionMap(names, quantity, unit, middle, reach, tuple(character.spec.joints))
 
 
-def _angle_axis(character: Character) -> AngleAxisMap:
+def _angle_axis(character: Character) -> ActionMap:
     """Returns the original's map of position actions."""
     ranges, ball = original_ranges(character), character.spherical
     span = np.ptp(ranges, axis=1)
@@ -234,15 +234,14 @@ def _angle_axis(character: Character) -> AngleAxisMap:
     action_offset[angles + 3] = AXIS_OFFSET
     action_scale[angles[:, None] + np.arange(1, 4)] = 1
     others = [np.cumsum(width)[~ball] - 1 for width in (sizes, character.dofs)]
-    return AngleAxisMap(
-        names, 'target angle and axis', _unit(character, 'rad and 1', 'm'), action_offset, action_scale,
-        tuple(character.spec.joints), angles=angles,
-        balls=_balls(character, 3)[:, None] + np.arange(3), hinges=np.array(others),
-    )  # fmt: skip
+    balls = {'angles': angles, 'angle_balls': _vectors(character), 'hinges': np.array(others)}
+    quantity, unit = 'target angle and axis', _unit(character, 'rad and 1', 'm')
+    actuators = tuple(character.spec.joints)
+    return ActionMap(names, quantity, unit, action_offset, action_scale, actuators, balls)
 
 
 def _add_muscle(
-    character: Character, timestep: float, muscle_set: str = muscle_tables.PLAIN, **_: object
+    character: Character, timestep: float, muscle_set: str = PLAIN, **_: object
 ) -> ActionMap:
     units = character_muscles(character, muscle_set)
     _prepare(character, timestep, character.torque_limits / MUSCLE_DAMPING_DIVISOR)
@@ -269,16 +268,12 @@ _MODELS: dict[str, Callable[..., ActionMap]] = {
 ACTUATIONS = tuple(_MODELS)
 
 
-def character_muscles(
-    character: Character, muscle_set: str = muscle_tables.PLAIN
-) -> tuple[Muscle, ...]:
+def character_muscles(character: Character, muscle_set: str = PLAIN) -> tuple[Muscle, ...]:
     """Returns a character's muscles: one of the sets of `trl_suite.actuation.muscles.MUSCLES`."""
     name = character.spec.name
-    sets = muscle_tables.MUSCLES.get(name)
+    sets = MUSCLES.get(name)
     if sets is None:
-        raise ValueError(
-            f'character {name!r} has no muscles; these have: {", ".join(muscle_tables.MUSCLES)}'
-        )
+        raise ValueError(f'character {name!r} has no muscles; these have: {", ".join(MUSCLES)}')
     errors.check_known(f'muscle set of {name!r}', sets, muscle_set)
     return sets[muscle_set]
 

@@ -22,7 +22,7 @@ from trl_suite.actuation import series, strength_curves
 from trl_suite.actuation.strength_curves import Curve
 from trl_suite.characters.character import Character, CharacterSpec
 from trl_suite.engine import World, motors
-from trl_suite.util.options import Config, Range, option
+from trl_suite.util.options import Config, Range, option, within
 
 NOISE_TIME = 0.02  # s; correlation time of the torque noise
 LONGEST_DELAY = 1000.0  # ms
@@ -34,14 +34,13 @@ _VELOCITY, _TENDONS = (
     'muscles act on links by rigid tendons, which span several joints',
 )
 NOT_FOR_MUSCLES = {  # option -> the reason
-    'torque_speed': _VELOCITY, 'no_load_speed': _VELOCITY, 'braking': _VELOCITY,
+    **dict.fromkeys(('torque_speed', 'no_load_speed', 'braking'), _VELOCITY),
     'torque_pose': 'the force of a muscle depends on its length already',
     'backlash': 'muscles pull on links without gears',
-    'flex': _TENDONS, 'flex_damping': _TENDONS,
-}  # fmt: skip
-_REQUIRED = {
-    'no_load_speed': 'torque_speed', 'braking': 'torque_speed', 'flex_damping': 'flex',
-}  # fmt: skip  # option -> the one that it modifies
+    **dict.fromkeys(('flex', 'flex_damping'), _TENDONS),
+}
+# Option -> the one that it modifies.
+_REQUIRED = {'no_load_speed': 'torque_speed', 'braking': 'torque_speed', 'flex_damping': 'flex'}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,8 +61,8 @@ class Actuators(Config):
     braking: float = option(
         1.5,
         'largest torque against the motion, in torque limits; with torque_speed',
-        at_least=1, at_most=2,
-    )  # fmt: skip
+        **within(1, 2),
+    )
     torque_pose: Any = option(
         None,
         "factors of the torque limits by joint angle and direction: True for the character's own (bipeds: "
@@ -73,38 +72,37 @@ class Actuators(Config):
         Range(0.0, 0.0),
         'time until a control takes effect, rounded to physics steps; or two bounds, between which it is '
         'drawn for each episode',
-        unit='ms', at_least=0, at_most=LONGEST_DELAY,
-    )  # fmt: skip
+        **within(0, LONGEST_DELAY, 'ms'),
+    )
     backlash: float = option(
         0.0,
         'free play between motor and link of every joint; of a ball joint the opening angle of a cone',
-        unit='rad', at_least=0, at_most=0.5,
-    )  # fmt: skip
+        **within(0, 0.5, 'rad'),
+    )
     flex: float = option(
         0.0,
         'deflection of a spring between motor and link of every joint at the torque limit; its stiffness '
         'is torque limit / flex',
-        unit='rad', at_least=0, at_most=1,
-    )  # fmt: skip
+        **within(0, 1, 'rad'),
+    )
     flex_damping: float = option(
         0.005,
         'damping of these springs relative to their stiffness',
-        unit='s',
-        at_least=0,
-        at_most=1,
+        **within(0, 1, 's'),
     )
     noise: float = option(
         0.0,
         'standard deviation of torque noise, in torque limits; an Ornstein-Uhlenbeck process for each '
         f'degree of freedom, with a correlation time of {NOISE_TIME:g} s',
-        at_least=0, at_most=0.5,
-    )  # fmt: skip
+        **within(0, 0.5),
+    )
     strength: Range = option(
         Range(1.0, 1.0),
         'factor of all torques of a motor or muscle, gains and limits included; or two bounds, between '
         'which it is drawn for each motor and episode',
-        above=0, at_most=2,
-    )  # fmt: skip
+        above=0,
+        at_most=2,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,10 +154,8 @@ class Units:
             joints = [int(model.actuator_trnid[each[0], 0]) for each in self.actuators]
         self.joints = np.array(joints)
         sizes = np.where(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_BALL, 3, 1)
-        self.dofs = np.concatenate([
-            model.jnt_dofadr[joint] + np.arange(size)
-            for joint, size in zip(self.joints, sizes, strict=True)
-        ]).astype(int)  # fmt: skip
+        starts = zip(model.jnt_dofadr[self.joints].tolist(), sizes.tolist(), strict=True)
+        self.dofs = np.array([dof for start, n in starts for dof in range(start, start + n)], int)
         self.dof_limits = np.repeat(self.limits, sizes)
 
 
@@ -188,13 +184,13 @@ def limits(
         return motors.limits()
     ball = model.jnt_type[units.joints] == mujoco.mjtJoint.mjJNT_BALL
     place = {name: k for k, name in enumerate(curves)}
-    turns = dict(zip(units.names, ball, strict=True))
-    # The engine takes rotations of ball joints about y, and the tables have those about -y.
-    rows = [
-        Curve(-curve.angle[::-1], curve.negative[::-1], curve.positive[::-1])
-        if turns[name] else curve
-        for name, curve in curves.items()
-    ]  # fmt: skip
+    rows = dict(curves)
+    for name, turns in zip(units.names, ball, strict=True):
+        if (
+            turns and name in curves
+        ):  # the engine takes rotations about y, and tables have those about -y
+            angle, positive, negative = curves[name]
+            rows[name] = Curve(-angle[::-1], negative[::-1], positive[::-1])
     single: list[tuple[Any, ...]] = []
     balls: list[tuple[Any, ...]] = []
     for unit, (ids, joint, limit) in enumerate(
@@ -216,7 +212,9 @@ def limits(
             balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, curve))
     speed = actuators.no_load_speed if actuators.torque_speed else np.inf
     braking = actuators.braking if actuators.torque_speed else 1.0
-    return motors.limits(_columns(single, 3), _columns(balls, 4), _table(rows), speed, braking)
+    return motors.limits(
+        _columns(single, 3), _columns(balls, 4), _table([*rows.values()]), speed, braking
+    )
 
 
 def _table(curves: Sequence[Curve]) -> motors.Curves | None:

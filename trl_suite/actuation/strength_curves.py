@@ -37,17 +37,11 @@ MOST = 10.0  # largest factor
 
 
 class Exertion(NamedTuple):
-    """Coefficients of one direction of a joint.
+    """Coefficients of one direction of a joint."""
 
-    Attributes:
-      c1: largest isometric torque / (weight * height).
-      c2: width: the torque is proportional to cos(c2 (angle - c3)).
-      c3: angle of the largest torque, rad.
-    """
-
-    c1: float
-    c2: float
-    c3: float
+    c1: float  # largest isometric torque / (weight * height)
+    c2: float  # width: the torque is proportional to cos(c2 (angle - c3))
+    c3: float  # angle of the largest torque, rad
 
 
 # Flexion is positive at hip and knee, dorsiflexion at the ankle; 0 is upright standing.
@@ -99,11 +93,7 @@ def _cosine(angle: np.ndarray) -> np.ndarray:
 def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -> dict[str, Curve]:
     """Returns the curves by joint of a character.
 
-    Args:
-      given: True for the character's own, 'human', a JSON file, or a table.
-      own: name of the character's own curves; None if it has none.
-      character: name of the character, for messages.
-      joints: its joints.
+    What is given is True for its own, whose name is `own`, 'human', a JSON file, or a table.
     """
     if given is True:
         if own is None:
@@ -120,20 +110,14 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
             )
         return curves
     if isinstance(given, (str, pathlib.Path)):
-        given = _read(pathlib.Path(given))
+        with errors.naming('torque_pose: cannot read the table', (OSError, ValueError)):
+            given = files.read_json(given)
     if not isinstance(given, Mapping):
         raise ValueError(
             f"torque_pose is {given!r}; expected True, 'human', a JSON file, or a table by joint"
         )
     errors.check_known(f'joint of {character!r} in torque_pose', joints, *given)
     return {joint: _curve(joint, entry) for joint, entry in given.items()}
-
-
-def _read(path: pathlib.Path) -> Any:
-    try:
-        return files.read_json(path)
-    except (OSError, ValueError) as error:
-        raise ValueError(f'torque_pose: cannot read the table: {error}') from None
 
 
 def _curve(joint: str, entry: Any) -> Curve:

@@ -34,6 +34,7 @@ RESET = 30  # calls between two resets of a raw simulation, a second of simulate
 ROUNDS = 8  # alternations of environment and raw batch, as the speed of machines varies
 PROJECTED = (16, 64)  # cores
 DRAWN = 100  # number of random actions, which are repeated
+CONTROLS = 10  # the same for MuJoCo alone
 
 
 class Stopwatch:
@@ -92,11 +93,7 @@ def physics_steps(environments: VectorEnvironment) -> int:
 def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> dict[str, Any]:
     """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
-    Args:
-      id: id of the environment.
-      num_envs: number of simulations.
-      threads: number of threads.
-      seconds: duration for the environment, and the same for the raw batch.
+    `seconds` is the duration for the environment, and the same for the raw batch.
 
     Returns:
       'control steps per second' of all simulations, resets included; 'physics' and 'engine':
@@ -107,6 +104,7 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
       as a multiple of those on one, by Amdahl's law from the serial part. Shared caches and memory
       are neglected.
     """
+    environments: Any
     environments, drawn = warmed(id, num_envs, threads)
     others, _ = warmed(id, num_envs, threads)
     world: Any = others.task.world
@@ -116,9 +114,11 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
     directly = acts_directly(others, world.models[0])  # else controls are 0
+    given = [others.action_map.control(next(drawn)) if directly else 0.0 for _ in range(CONTROLS)]
 
     def step() -> None:
-        controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
+        given.append(given.pop(0))
+        controls[:] = given[0]
         world.share(lambda part: world.step(substeps, part), world.all_ids)
 
     control = Stopwatch(lambda: environments.step(next(drawn)), lambda: num_envs)
@@ -165,17 +165,10 @@ def raw(
     state: np.ndarray | None = None,
     limp: bool = False,
 ) -> float:
-    """Measures `mj_step` of a model under random controls, reset each second of simulated time.
+    """Returns controls per second of `mj_step`, with `substeps` physics steps each.
 
-    Args:
-      model: the model.
-      substeps: physics steps per control.
-      seconds: duration.
-      state: mjSTATE_INTEGRATION to reset to; by default the model's initial state.
-      limp: whether controls are 0.
-
-    Returns:
-      Controls per second, with `substeps` physics steps each.
+    Controls are random, or 0 if `limp`. Each second of simulated time, the model is reset to a
+    state (mjSTATE_INTEGRATION), by default its initial one.
     """
     import mujoco
 
@@ -226,11 +219,7 @@ def bench(
 ) -> dict[str, Any]:
     """Measures an environment on this machine.
 
-    Args:
-      id: id or alias of the environment.
-      num_envs: number of simulations of the vector environment.
-      threads: number of threads; 0 for all usable cores.
-      seconds: duration of each of four measurements.
+    With 0 threads, all usable cores are used. Each of four measurements lasts `seconds`.
 
     Returns:
       A dict that can be written as JSON: 'machine', 'id', 'num_envs', 'threads', the results of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trl_suite.actuation.action_map import ActionMap, AngleAxisMap
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.bodies.blocks import SPIN, Reflection
 from trl_suite.characters import Character
 
@@ -15,7 +15,7 @@ def action_reflection(character: Character, action_map: ActionMap) -> Reflection
     """Returns the reflection of actions, i.e. joint targets or torques."""
     spec = character.spec
     joints = list(spec.joints)
-    ball = ANGLE_AXIS if isinstance(action_map, AngleAxisMap) else SPIN
+    ball = ANGLE_AXIS if action_map.has_axes else SPIN
     starts: list[int] = []
     signs: list[float] = []
     for spherical in character.spherical.tolist():
