@@ -16,6 +16,12 @@ from trl_suite.util.options import checked
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
 DIGITS = 6  # decimals of the values in a fingerprint
+# The fields of a model whose values are in a fingerprint.
+_OF_BODIES = (
+    *('body_mass', 'body_inertia', 'body_ipos', 'body_pos', 'body_quat'),
+    *('jnt_type', 'jnt_pos', 'jnt_axis', 'jnt_range', 'jnt_actfrcrange'),
+)
+_OF_GEOMS = ('geom_size', 'geom_pos', 'geom_quat', 'geom_friction')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +53,10 @@ class Joint:
     armature: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ('kp', 'kd', 'weight', 'armature', 'target', 'original_range'):
-            value = getattr(self, name)
-            if name in ('target', 'original_range'):
-                errors.floats(f'{name} of a joint', 0.0 if value is None else value)
-            else:
-                checked(f'{name} of a joint', value, float, at_least=0)
+        for name in ('kp', 'kd', 'weight', 'armature'):
+            checked(f'{name} of a joint', getattr(self, name), float, at_least=0)
+        for name, value in (('target', self.target), ('original_range', self.original_range or 0)):
+            errors.floats(f'{name} of a joint', value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,8 +123,15 @@ class CharacterSpec:
 
     @functools.cached_property
     def digest(self) -> str:
-        """See `fingerprint`."""
-        return _digest(self)  # it compiles the character
+        """See `fingerprint`; it compiles the character."""
+        model = mjcf.Physics.from_mjcf_model(Character(self).mjcf_model).model
+        figures: list[Any] = [getattr(model, name) for name in _OF_BODIES]
+        figures += [getattr(model, name)[_solid(self, model)] for name in _OF_GEOMS]
+        figures.append([(joint.kp, joint.kd, joint.armature) for joint in self.joints.values()])
+        digest = hashlib.sha256()
+        for array in figures:
+            digest.update((np.asarray(array, float).round(DIGITS) + 0.0).tobytes())
+        return f'{self.name} {digest.hexdigest()[:16]}'
 
 
 class Character(composer.Entity):
@@ -130,7 +141,7 @@ class Character(composer.Entity):
     only when an actuation model is added (see `trl_suite.actuation`).
     """
 
-    def _build(self, spec: CharacterSpec, name: str | None = None) -> None:  # type: ignore[override]
+    def _build(self, spec: CharacterSpec, name: str | None = None) -> None:
         self.spec = spec
         if spec.xml is not None:
             self._mjcf_root = mjcf.from_xml_string(spec.xml, assets=dict(spec.assets))
@@ -240,21 +251,6 @@ def fingerprint(spec: CharacterSpec) -> str:
     return spec.digest
 
 
-def _digest(spec: CharacterSpec) -> str:
-    model = mjcf.Physics.from_mjcf_model(Character(spec).mjcf_model).model
-    solid = _solid(spec, model)
-    figures = [
-        model.body_mass, model.body_inertia, model.body_ipos, model.body_pos, model.body_quat,
-        model.jnt_type, model.jnt_pos, model.jnt_axis, model.jnt_range, model.jnt_actfrcrange,
-        model.geom_size[solid], model.geom_pos[solid], model.geom_quat[solid],
-        model.geom_friction[solid], [(j.kp, j.kd, j.armature) for j in spec.joints.values()],
-    ]  # fmt: skip
-    digest = hashlib.sha256()
-    for array in figures:
-        digest.update((np.asarray(array, float).round(DIGITS) + 0.0).tobytes())
-    return f'{spec.name} {digest.hexdigest()[:16]}'
-
-
 def body_figures(character: Character) -> dict[str, Any]:
     """Compiles a character alone and returns its whole-body properties in the zero pose.
 
@@ -263,26 +259,22 @@ def body_figures(character: Character) -> dict[str, Any]:
       of mass (kg m^2, diagonal (3,)) and `standing_height` of the root above the sole (m).
     """
     physics = mjcf.Physics.from_mjcf_model(character.mjcf_model)
-    model, data = physics.model, physics.data
-    mass = model.body_mass[1:]
-    centres = data.xipos[1:]
-    com = mass @ centres / mass.sum()
-    inertia = np.zeros((3, 3))
-    for m, centre, frame, principal in zip(
-        mass, centres - com, data.ximat[1:].reshape(-1, 3, 3), model.body_inertia[1:], strict=True
-    ):
-        inertia += frame @ np.diag(principal) @ frame.T
-        inertia += m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    lowest = min(
-        lowest_point(data.geom_xpos[i], data.geom_xmat[i], model.geom_aabb[i, 3:])
-        for i in np.flatnonzero(_solid(character.spec, model))
-    )
+    model, data = physics.model, physics.data  # body 1 is the root
+    low, _ = extent(model, data, np.flatnonzero(_solid(character.spec, model)))
     return {
-        'mass': float(mass.sum()),
-        'com': com,
-        'inertia': np.diag(inertia).copy(),
-        'standing_height': -float(lowest),
+        'mass': float(model.body_subtreemass[1]),
+        'com': data.subtree_com[1].copy(),
+        'inertia': data.crb[1, :3].copy(),
+        'standing_height': -float(low[2]),
     }
+
+
+def extent(model: Any, data: Any, geoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the lowest and the highest corner, (3,) m, of the bounding box of geoms."""
+    axes, boxes = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms]
+    middle = data.geom_xpos[geoms] + np.einsum('nij,nj->ni', axes, boxes[:, :3])
+    half = np.einsum('nij,nj->ni', np.abs(axes), boxes[:, 3:])
+    return (middle - half).min(0), (middle + half).max(0)
 
 
 def _solid(spec: CharacterSpec, model: Any) -> np.ndarray:
@@ -290,8 +282,3 @@ def _solid(spec: CharacterSpec, model: Any) -> np.ndarray:
     if spec.collision_geoms is None:
         return model.geom_group == GROUP_COLLISION
     return np.isin([model.id2name(i, 'geom') for i in range(model.ngeom)], spec.collision_geoms)
-
-
-def lowest_point(position: np.ndarray, matrix: np.ndarray, half_size: np.ndarray) -> float:
-    """Height of the lowest corner of a box, m."""
-    return float(position[2] - np.abs(matrix.reshape(3, 3)[2]) @ half_size)

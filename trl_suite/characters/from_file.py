@@ -55,9 +55,8 @@ Names = Collection[str] | None
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
 _DIVERGED = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-]  # fmt: skip
+    int(getattr(mujoco.mjtWarning, f'mjWARN_BADQ{kind}')) for kind in ('POS', 'VEL', 'ACC')
+]
 SOFT = (0.02, 1.0)  # MuJoCo's default for joint limits: not the choice of the file's author
 CAMERA_AWAY = 3.2  # distance of cameras, in reaches of the character
 
@@ -116,14 +115,17 @@ def from_file(
         value, and the closest matches of an unknown name.
       TypeError: parameters of a joint that are not a `Joint`.
     """
-    for option, value, kind in (
-        ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
-        ('description', description, str), ('balance_inertia', balance_inertia, bool),
-        ('end_effectors', end_effectors, Names), ('fall_links', fall_links, Names),
-        ('stumble_exempt', stumble_exempt, Names),
-    ):  # fmt: skip
-        checked(option, value, kind)
-    if end_effectors is not None and not len(end_effectors):
+    checked('root', root, str | None)
+    checked('spatial', spatial, bool | None)
+    checked('name', name, str | None)
+    checked('description', description, str)
+    checked('balance_inertia', balance_inertia, bool)
+    names = [
+        checked('end_effectors', end_effectors, Names),
+        checked('fall_links', fall_links, Names),
+        checked('stumble_exempt', stumble_exempt, Names),
+    ]
+    if names[0] == ():
         raise ValueError(f'end_effectors is {end_effectors!r}; expected one name or more')
     if name == '':
         raise ValueError("name is ''; expected a name, or None for that of the file")
@@ -137,17 +139,10 @@ def from_file(
     if name in CHARACTERS:
         raise ValueError(f'the suite has a character named {name!r}; pass another name=')
     file.open('rb').close()  # raises an OSError if it cannot be read
-    try:
-        spec = limited.call(
-            _read, os.path.abspath(file), name, description, root, spatial, rotation, balance_inertia,
-            *(
-                None if names is None else tuple(names)
-                for names in (end_effectors, fall_links, stumble_exempt)
-            ),
-        )  # fmt: skip
+    with errors.naming(file):
+        about = name, description, root, spatial, rotation, balance_inertia
+        spec = limited.call(_read, os.path.abspath(file), *about, *names)
         errors.check_known('joint', spec.joints, *joints or {})
-    except ValueError as error:
-        raise ValueError(f'{file}: {error}') from None
     for joint, own in (joints or {}).items():
         if not isinstance(own, Joint):
             raise TypeError(f'joints[{joint!r}] is {own!r}; expected a characters.Joint')
@@ -287,10 +282,9 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
             body = tree.find('body', name)
             if body.inertial is not None:
                 body.inertial.remove()
-            body.add(
-                'inertial', mass=model.body_mass[i], diaginertia=model.body_inertia[i],
-                pos=model.body_ipos[i], quat=model.body_iquat[i],
-            )  # fmt: skip
+            place = {'pos': model.body_ipos[i], 'quat': model.body_iquat[i]}
+            mass, inertia = model.body_mass[i], model.body_inertia[i]
+            body.add('inertial', mass=mass, diaginertia=inertia, **place)
     for i in found.joints:
         name = model.joint(i).name
         joint = tree.find('joint', name)
@@ -346,7 +340,6 @@ def _stage(tree: mjcf.RootElement, root: mjcf.Element, reach: float) -> None:
         root.add(
             'camera', name=name, mode='trackcom', pos=away * np.array(place), xyaxes=axes, fovy=45
         )
-    root.add(
-        'light', name='sun', mode='trackcom', pos=(-1.2, 1.2, 4), dir=(0.3, -0.3, -1),
-        directional=True, castshadow=True, diffuse=(0.5, 0.5, 0.48), specular=(0.1,) * 3,
-    )  # fmt: skip
+    light = {'diffuse': (0.5, 0.5, 0.48), 'specular': (0.1,) * 3, 'castshadow': True}
+    sun = {'pos': (-1.2, 1.2, 4), 'dir': (0.3, -0.3, -1), 'directional': True}
+    root.add('light', name='sun', mode='trackcom', **sun, **light)

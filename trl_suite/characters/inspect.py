@@ -33,11 +33,14 @@ _FREE, _BALL, _SLIDE, _HINGE = (
     int(getattr(mujoco.mjtJoint, f'mjJNT_{kind}')) for kind in ('FREE', 'BALL', 'SLIDE', 'HINGE')
 )
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_SIDES = (
-    ('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'), ('l$', 'r'), ('L$', 'R'),
+_SIDES = (  # patterns of left names, and the right ones
+    *(('left', 'right'), ('Left', 'Right')),
+    *(('(^|_)l', r'\1r'), ('(^|_)L', r'\1R')),
+    *(('l$', 'r'), ('L$', 'R')),
     # Front, rear, hind, back and middle legs, such as FL_hip and RL_hip.
-    ('(^|[^A-Za-z])([frhbm])l(?![a-z])', r'\1\2r'), ('(^|[^A-Za-z])([FRHBM])L(?![a-z])', r'\1\2R'),
-)  # fmt: skip
+    ('(^|[^A-Za-z])([frhbm])l(?![a-z])', r'\1\2r'),
+    ('(^|[^A-Za-z])([FRHBM])L(?![a-z])', r'\1\2R'),
+)
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
 
 

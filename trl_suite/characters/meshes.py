@@ -20,9 +20,7 @@ CONVERTED = ('.dae', '.ply', '.stl')  # .stl as text only
 def prepare(spec: mujoco.MjSpec, file: pathlib.Path) -> None:
     """Finds the files of all meshes, and replaces those that MuJoCo does not read by their content.
 
-    Args:
-      spec: the model, which is changed.
-      file: its file, an absolute path.
+    The path of the model's file is absolute.
     """
     bodies = users(spec)
     for mesh in spec.meshes:
@@ -65,8 +63,9 @@ def _path(address: str, file: pathlib.Path) -> str:
     if not colon or not re.fullmatch(r'[A-Za-z][\w+.-]+', scheme):  # one letter is a drive
         return address
     if scheme == 'file':
-        host, path = re.fullmatch('(?://([^/]*))?(.*)', rest, re.DOTALL).groups()  # type: ignore[union-attr]
-        if host not in (None, '', 'localhost') or not path.startswith('/'):
+        host, slash, path = rest[2:].partition('/') if rest.startswith('//') else ('', '', rest)
+        path = slash + path
+        if host not in ('', 'localhost') or not path.startswith('/'):
             raise ValueError(
                 f'{address!r} is not the address of a file on this machine; expected an absolute '
                 'path after file://, such as file:///robots/leg.stl'

@@ -190,13 +190,7 @@ def find_root(model: mujoco.MjModel, root: str | None) -> int:
 def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjModel:
     """Rotates the children of a body, so that the axes of the body are those of the world.
 
-    Args:
-      spec: the file as read, which is changed.
-      root: name of the body, a child of the world.
-      rotation: rotation of its children, unit quaternion wxyz.
-
-    Returns:
-      The compiled file.
+    The rotation is a unit quaternion wxyz. Returns the compiled file.
     """
     body = spec.body(root)
     for equality in spec.equalities:

@@ -10,150 +10,103 @@ from trl_suite.characters.character import CharacterSpec, Joint
 # are effectively 0.61 rad higher), but scales actions by the numbers in the file.
 _FILE_RANGE = (-1.57, 1.57)
 
+
+def _joints(kp: float, weight: float, **targets: float) -> dict[str, Joint]:
+    """Returns joints that differ in name and working posture; kd is a tenth of kp."""
+    return {name: Joint(kp, kp / 10, weight, target) for name, target in targets.items()}
+
+
+def _sides(**joints: Joint) -> dict[str, Joint]:
+    """Returns the joints of both sides of a body, those of the right side first."""
+    return {f'{side}_{name}': joint for side in ('right', 'left') for name, joint in joints.items()}
+
+
 # Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; for a
 # prismatic joint read m for rad and N for N m. The MJCF files define which joints are spherical.
 _DOG_JOINTS = {
     'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
-    'spine1': Joint(200, 20, 0.5),
-    'spine2': Joint(200, 20, 0.5),
-    'spine3': Joint(200, 20, 0.5),
-    'torso': Joint(200, 20, 1),
-    'neck0': Joint(50, 5, 0.2, 0.68507),
-    'neck1': Joint(50, 5, 0.2, 0.2),
-    'head': Joint(50, 5, 0.2, 0.20456),
-    'tail0': Joint(4, 0.4, 0.001, 0.4),
-    'tail1': Joint(4, 0.4, 0.001, 0.2),
-    'tail2': Joint(4, 0.4, 0.001, 0.2),
-    'tail3': Joint(4, 0.4, 0.001, 0.2),
-    'shoulder': Joint(160, 16, 1, -0.5224),
-    'elbow': Joint(80, 8, 1, 0.87117),
-    'wrist': Joint(80, 8, 1, 0.11488),
-    'finger': Joint(80, 8, 1, -0.46365),
+    **_joints(200, 0.5, spine1=0, spine2=0, spine3=0),
+    **_joints(200, 1, torso=0),
+    **_joints(50, 0.2, neck0=0.68507, neck1=0.2, head=0.20456),
+    **_joints(4, 0.001, tail0=0.4, tail1=0.2, tail2=0.2, tail3=0.2),
+    **_joints(160, 1, shoulder=-0.5224),
+    **_joints(80, 1, elbow=0.87117, wrist=0.11488, finger=-0.46365),
     'hip': Joint(130, 13, 1, 0.61719, original_range=_FILE_RANGE),
-    'knee': Joint(50, 5, 1, -1.31193),
-    'ankle': Joint(50, 5, 1, 1.32022),
-    'toe': Joint(50, 5, 1, -0.62549),
+    **_joints(50, 1, knee=-1.31193, ankle=1.32022, toe=-0.62549),
 }
 
 _RAPTOR_JOINTS = {
-    'spine0': Joint(200, 20, 0.5, 0.16682),
-    'spine1': Joint(200, 20, 0.5, 0.03457),
-    'spine2': Joint(100, 10, 0.5, 0.11743),
-    'spine3': Joint(100, 10, 0.5, 0.11914),
-    'head': Joint(100, 10, 0.5, 0.75355),
-    'tail0': Joint(100, 10, 0.25, 0.09288),
-    'tail1': Joint(50, 5, 0.25, 0.04206),
-    'tail2': Joint(50, 5, 0.25, 0.12818),
-    'tail3': Joint(50, 5, 0.25, 0.01178),
-    'tail4': Joint(50, 5, 0.25, 0.24638),
-    'right_hip': Joint(300, 30, 1, 0.46487),
-    'right_knee': Joint(300, 30, 0.5, -1.456),
-    'right_ankle': Joint(250, 25, 0.5, 1.37779),
-    'right_toe': Joint(100, 10, 0.5, -0.3883),
-    'left_hip': Joint(300, 30, 1, 0.46487),
-    'left_knee': Joint(300, 30, 0.5, -1.456),
-    'left_ankle': Joint(250, 25, 0.5, 1.37779),
-    'left_toe': Joint(100, 10, 0.5, -0.3883),
+    **_joints(200, 0.5, spine0=0.16682, spine1=0.03457),
+    **_joints(100, 0.5, spine2=0.11743, spine3=0.11914, head=0.75355),
+    **_joints(100, 0.25, tail0=0.09288),
+    **_joints(50, 0.25, tail1=0.04206, tail2=0.12818, tail3=0.01178, tail4=0.24638),
+    **_sides(
+        hip=Joint(300, 30, 1, 0.46487),
+        knee=Joint(300, 30, 0.5, -1.456),
+        ankle=Joint(250, 25, 0.5, 1.37779),
+        toe=Joint(100, 10, 0.5, -0.3883),
+    ),
 }
 
-_BIPED2D_JOINTS = {
-    'right_hip': Joint(300, 30, 0.3),
-    'right_knee': Joint(300, 30, 0.3),
-    'right_ankle': Joint(100, 10, 0.2),
-    'left_hip': Joint(300, 30, 0.3),
-    'left_knee': Joint(300, 30, 0.3),
-    'left_ankle': Joint(100, 10, 0.2),
-}
-
-_BIPED2D_SIMBICON_JOINTS = {
-    'right_hip': Joint(200, 20, 0.3),
-    'right_knee': Joint(200, 20, 0.3),
-    'right_ankle': Joint(150, 15, 0.2),
-    'left_hip': Joint(200, 20, 0.3),
-    'left_knee': Joint(200, 20, 0.3),
-    'left_ankle': Joint(150, 15, 0.2),
-}
-
+_BIPED2D_JOINTS = _sides(
+    hip=Joint(300, 30, 0.3), knee=Joint(300, 30, 0.3), ankle=Joint(100, 10, 0.2)
+)
+_BIPED2D_SIMBICON_JOINTS = _sides(
+    hip=Joint(200, 20, 0.3), knee=Joint(200, 20, 0.3), ankle=Joint(150, 15, 0.2)
+)
+_ARMS = _sides(shoulder=Joint(150, 15, 0.3), forearm=Joint(100, 10, 0.3))
 _BIPED2D_FULL_JOINTS = {
-    'right_hip': Joint(200, 20, 0.3),
-    'right_knee': Joint(200, 20, 0.3),
-    'right_ankle': Joint(100, 10, 0.2),
-    'left_hip': Joint(200, 20, 0.3),
-    'left_knee': Joint(200, 20, 0.3),
-    'left_ankle': Joint(100, 10, 0.2),
-    'right_shoulder': Joint(150, 15, 0.3),
-    'right_forearm': Joint(100, 10, 0.3),
-    'left_shoulder': Joint(150, 15, 0.3),
-    'left_forearm': Joint(100, 10, 0.3),
+    **_sides(hip=Joint(200, 20, 0.3), knee=Joint(200, 20, 0.3), ankle=Joint(100, 10, 0.2)),
+    **_ARMS,
     'neck': Joint(100, 10, 0.3),
 }
 
 # The original calls these two spine0 and spine1. The leg is prismatic.
-_HOPPER_JOINTS = {
-    'hip': Joint(200, 20, 0.5),
-    'leg': Joint(1000, 20, 0.5),
-}
+_HOPPER_JOINTS = {'hip': Joint(200, 20, 0.5), 'leg': Joint(1000, 20, 0.5)}
 
 _BIPED3D_JOINTS = {
     'torso': Joint(1000, 100, 0.5),
-    'right_hip': Joint(300, 30, 0.5),
-    'right_knee': Joint(300, 30, 0.3),
-    'right_ankle': Joint(100, 10, 0.2),
-    'left_hip': Joint(300, 30, 0.5),
-    'left_knee': Joint(300, 30, 0.3),
-    'left_ankle': Joint(100, 10, 0.2),
+    **_sides(hip=Joint(300, 30, 0.5), knee=Joint(300, 30, 0.3), ankle=Joint(100, 10, 0.2)),
 }
-
 # Five times the gain with half the foot: with an armature of 0.01 an ankle at its torque limit may
 # oscillate.
 _BIPED3D_MOCAP_RUN_JOINTS = {
     'torso': Joint(1000, 100, 0.5),
-    'right_hip': Joint(500, 50, 0.5),
-    'right_knee': Joint(500, 50, 0.3),
-    'right_ankle': Joint(500, 50, 0.2, armature=0.03),
-    'left_hip': Joint(500, 50, 0.5),
-    'left_knee': Joint(500, 50, 0.3),
-    'left_ankle': Joint(500, 50, 0.2, armature=0.03),
+    **_sides(
+        hip=Joint(500, 50, 0.5),
+        knee=Joint(500, 50, 0.3),
+        ankle=Joint(500, 50, 0.2, armature=0.03),
+    ),
 }
-
 # The original's spelling is sholder. Arms and head move by a hundredth of a radian.
+_RIGID = Joint(100, 10, 0.001)
 _BIPED3D_FULL_MOCAP_JOINTS = {
     **_BIPED3D_JOINTS,
-    'right_shoulder': Joint(100, 10, 0.001),
-    'right_elbow': Joint(100, 10, 0.001),
-    'right_wrist': Joint(100, 10, 0.001),
-    'left_shoulder': Joint(100, 10, 0.001),
-    'left_elbow': Joint(100, 10, 0.001),
-    'left_wrist': Joint(100, 10, 0.001),
-    'neck': Joint(100, 10, 0.001),
-    'head': Joint(100, 10, 0.001),
+    **_sides(shoulder=_RIGID, elbow=_RIGID, wrist=_RIGID),
+    'neck': _RIGID,
+    'head': _RIGID,
 }
-
 # The only spherical joints whose limits are not symmetric.
-_BIPED3D_SIMBICON_JOINTS = {
-    'right_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
-    'right_knee': Joint(200, 20, 0.3),
-    'right_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
-    'left_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
-    'left_knee': Joint(200, 20, 0.3),
-    'left_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
-}
+_BIPED3D_SIMBICON_JOINTS = _sides(
+    hip=Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
+    knee=Joint(200, 20, 0.3),
+    ankle=Joint(100, 10, 0.2, original_range=(-1, 0.57)),
+)
 
+_SPINE = ('spine0', 'spine1', 'spine2', 'spine3')
 _TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
 _BORROWED = ('the original has no muscles for this character; those of another character are used',)
 
 DOG = CharacterSpec(
     name='dog',
     joints=_DOG_JOINTS,
-    fall_links=(
-        'root', 'spine0', 'spine1', 'spine2', 'spine3', 'torso', 'neck0', 'neck1', 'head',
-    ),
+    fall_links=('root', *_SPINE, 'torso', 'neck0', 'neck1', 'head'),
     end_effectors=('finger', 'toe'),
     stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
     description='Dog, 21 links: a segmented spine, a tail, one simulated front and hind leg.',
     clip='dog_bound',
     differences={'position': _TO_PARENT},
-)  # fmt: skip
+)
 
 _GOAT_JOINTS = {name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()}
 _GOAT_JOINTS['neck0'] = dataclasses.replace(_GOAT_JOINTS['neck0'], target=0.40041)
@@ -179,7 +132,7 @@ GOAT = CharacterSpec(
 RAPTOR = CharacterSpec(
     name='raptor',
     joints=_RAPTOR_JOINTS,
-    fall_links=('root', 'spine0', 'spine1', 'spine2', 'spine3', 'head'),
+    fall_links=('root', *_SPINE, 'head'),
     end_effectors=('right_toe', 'left_toe'),
     stumble_exempt=('right_toe', 'left_toe', 'right_ankle', 'left_ankle'),
     description='Raptor, 19 links: a heavy pelvis between a neck, a tail and two bird legs.',
@@ -222,17 +175,14 @@ BIPED2D_SIMBICON = CharacterSpec(
 BIPED2D_FULL = CharacterSpec(
     name='biped2d_full',
     joints=_BIPED2D_FULL_JOINTS,
-    fall_links=(
-        'root', 'right_hip', 'left_hip', 'right_shoulder', 'right_forearm', 'left_shoulder',
-        'left_forearm', 'neck',
-    ),
+    fall_links=('root', 'right_hip', 'left_hip', *_ARMS, 'neck'),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
     torque_curves='human',
     description='Biped with arms and head, 12 links, with human torque limits.',
     clip='biped2d_full_walk',
     differences={'muscle': _BORROWED},
-)  # fmt: skip
+)
 
 HOPPER = CharacterSpec(
     name='hopper',
@@ -301,7 +251,7 @@ BIPED3D_SIMBICON = CharacterSpec(
 CHARACTERS: dict[str, CharacterSpec] = {
     spec.name: spec
     for spec in (
-        DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER, BIPED3D, BIPED3D_MOCAP,
-        BIPED3D_MOCAP_RUN, BIPED3D_FULL_MOCAP, BIPED3D_SIMBICON,
+        *(DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER, BIPED3D),
+        *(BIPED3D_MOCAP, BIPED3D_MOCAP_RUN, BIPED3D_FULL_MOCAP, BIPED3D_SIMBICON),
     )
-}  # fmt: skip
+}

@@ -96,12 +96,15 @@ def _options(text: str) -> str:
 def _report(spec: CharacterSpec, environment: Environment) -> str:
     """Returns the properties of a character, after a reset of its environment on level ground."""
     from trl_suite.characters import inspect
+    from trl_suite.characters.character import extent
 
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     character = environment.task.character
     own = np.flatnonzero(model.body_rootid == _root(environment))
     pairs, inside = _colliding(model, own), _contacts(model, data, own)
-    low, high = _extent(model, data, own)
+    touching = (model.geom_contype | model.geom_conaffinity) != 0
+    solid = np.flatnonzero(np.isin(model.geom_bodyid, own) & touching)
+    low, high = extent(model, data, solid)
     bodies = zip(spec.links, character.bodies, strict=True)
     forward = inspect.facing({name: environment.physics.bind(body).xipos for name, body in bodies})
     looks = 'unknown, since no links are named left and right'
@@ -165,16 +168,6 @@ def _contacts(model: Any, data: Any, bodies: np.ndarray) -> list[float]:
         for contact in data.contact
         if np.isin(model.geom_bodyid[[contact.geom1, contact.geom2]], bodies).all()
     ]
-
-
-def _extent(model: Any, data: Any, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns lowest and highest corner, (3,) m, of the bounding box of collision geoms."""
-    touching = (model.geom_contype | model.geom_conaffinity) != 0
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & touching)
-    axes = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    middle = data.geom_xpos[geoms] + np.einsum('nij,nj->ni', axes, model.geom_aabb[geoms, :3])
-    half = np.einsum('nij,nj->ni', np.abs(axes), model.geom_aabb[geoms, 3:])
-    return (middle - half).min(0), (middle + half).max(0)
 
 
 def _stand(environment: Environment) -> str:
