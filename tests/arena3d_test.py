@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
+from helpers import height_map, surface_velocity, velocity_map
 
 from trl_suite import terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
@@ -229,7 +230,7 @@ class DynamicsTest(parameterized.TestCase):
         for seed in range(4):
             stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
             around = stage.arena.seen()
-            speed = around.velocity(np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
+            speed = surface_velocity(around, np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
             self.assertAlmostEqual(abs(speed), {'conveyor3d': 0.4}.get(source, 0.6))
             stage.put((4, 0, 0.11))
             stage.run(1.0)
@@ -384,7 +385,7 @@ class WorldTest(parameterized.TestCase):
             stage.world.step(SUBSTEPS)
             xy = stage.position[:, :2].copy()
             around = stage.arena.seen()
-            maps = around.height_map(xy, heading), around.velocity_map(xy, heading)
+            maps = height_map(around, xy, heading), velocity_map(around, xy, heading)
             seen.append(np.concatenate([stage.position, stage.velocity, *maps], 1))
         return np.stack(seen, 1)
 

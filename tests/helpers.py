@@ -12,6 +12,7 @@ from absl.testing import parameterized
 
 from trl_suite import suite, terrain
 from trl_suite.registry import catalogue
+from trl_suite.terrain.spatial import windows
 from trl_suite.vector import VectorEnvironment
 
 # The first id of each task type with each character: for what depends on nothing else.
@@ -111,6 +112,29 @@ def heading_of(environment):
 def ground(environment, x, y):
     """Height of three-dimensional ground, by a copy of it, m."""
     return terrain.SpatialGround.from_state(environment.task.arena.grounds[0].state()).height(x, y)
+
+
+def surface_velocity(around, x, y, env_ids=slice(None)):
+    """Velocities of the surface at points (simulations, k), (simulations, k, 2)."""
+    return np.array([
+        [windows.velocity(i, *point, around.pack) for point in zip(*row, strict=True)]
+        for i, *row in zip(np.arange(len(around.grounds))[env_ids], x, y, strict=True)
+    ])  # fmt: skip
+
+
+def height_map(around, xy, heading, env_ids=slice(None), query=windows.height_map, size=1024):
+    """Maps of simulations around positions (simulations, 2), (simulations, size)."""
+    maps = np.empty((len(xy), size))
+    for i, at, psi, out in zip(
+        np.arange(len(around.grounds))[env_ids], xy, heading, maps, strict=True
+    ):
+        query(i, *at, psi, around.pack, out)
+    return maps
+
+
+def velocity_map(around, xy, heading, env_ids=slice(None)):
+    """As `height_map`, of velocities, (simulations, 2048)."""
+    return height_map(around, xy, heading, env_ids, windows.velocity_map, 2048)
 
 
 def links_on_ground(environment):

@@ -17,7 +17,7 @@ sorted(terrain.PRESETS3D), sorted(terrain.GENERATORS3D)  # `register3d` adds a t
 
 around = terrain.Surroundings(1, terrain.capacity(terrain.load('pillars3d')))  # for n characters
 around.begin(0, forest, (x, y))
-around.height_map(np.array([[x, y]]), np.array([heading]))  # (1, 1024), 32 x 32 samples
+around.height(np.array([[x, x + 1]]), np.array([[y, y]]))  # (1, 2)
 
 terrain.from_mesh('canyon.glb')  # also from_image, from_heights, from_function
 terrain.save_mesh(forest, 'forest.obj', low=-20, high=20)

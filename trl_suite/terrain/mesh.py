@@ -38,8 +38,10 @@ LARGEST_SIDE = 500.0  # m; of the exported piece
 
 # Numbers of an element of a glTF accessor.
 _NUMBERS = {
-    'SCALAR': 1, 'VEC2': 2, 'VEC3': 3, 'VEC4': 4, 'MAT2': 4, 'MAT3': 9, 'MAT4': 16,
-}  # fmt: skip
+    'SCALAR': 1,
+    **{f'VEC{n}': n for n in (2, 3, 4)},
+    **{f'MAT{n}': n * n for n in (2, 3, 4)},
+}
 _PART = LARGEST // MOST_PARTS  # numbers that count for a part, or for each node above a node
 # Without a handler, Python would print trimesh's warnings, which have strings of the file in them.
 logging.getLogger('trimesh').addHandler(logging.NullHandler())
@@ -91,9 +93,8 @@ def save_mesh(
     """Writes a piece of ground as a mesh file.
 
     Args:
-      ground: the ground to export.
+      ground, low, high: as for `to_mesh`.
       path: .obj, .glb (written with the y axis up, as that format requires) or .stl.
-      low, high: as for `to_mesh`.
 
     Raises:
       ValueError: another suffix, or as for `to_mesh`.
@@ -162,11 +163,10 @@ def _box(box: Boxes, level: float | None, low: np.ndarray, high: np.ndarray) -> 
     upper = top + slope * along
     bottom = upper.min() - DEPTH if level is None else level
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    return np.stack([
-        position[0] + cosine * along - sine * across,
-        position[1] + sine * along + cosine * across,
-        np.where(signs[:, 2] > 0, upper, bottom),
-    ], 1), np.asarray(unit.faces)  # fmt: skip
+    x = position[0] + cosine * along - sine * across
+    y = position[1] + sine * along + cosine * across
+    z = np.where(signs[:, 2] > 0, upper, bottom)
+    return np.stack([x, y, z], 1), np.asarray(unit.faces)
 
 
 def read_triangles(file: pathlib.Path) -> np.ndarray:

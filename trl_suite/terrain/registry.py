@@ -59,13 +59,7 @@ def limited(low: float, high: float, unit: str = 'm', /, **defaults: float) -> d
 def check(
     where: str, values: Mapping[str, Any], parameters: Mapping[str, Parameter]
 ) -> dict[str, float]:
-    """Returns parameter values as floats.
-
-    Args:
-      where: the owner of the values, for the message.
-      values: name -> number.
-      parameters: the parameters, which have the values that are not given.
-    """
+    """Returns the values of some parameters as floats; `where` is their owner, for messages."""
     given = {}
     for key, value in values.items():
         bounds: Any = dict(zip(('at_least', 'at_most'), parameters[key][1:3], strict=True))

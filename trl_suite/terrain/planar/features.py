@@ -190,15 +190,14 @@ def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, run
 
 @compiled
 def _draw_features(
-    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, counts: np.ndarray,
-    levels: np.ndarray,
-) -> tuple[int, int]:  # fmt: skip
+    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, runs: Runs
+) -> tuple[int, int]:
     """Draws features until no vertices are missing, or the arrays are full.
 
     Returns:
       The number of runs, and the number of vertices that are still missing.
     """
-    runs = Runs(counts, levels)
+    counts, levels = runs.counts, runs.levels
     base = levels[number - 1] if number else 0.0
     while missing > 0 and number + _MOST_RUNS <= len(counts):
         before, number = number, _draw_feature(kind, number, parameters, bits, runs)
@@ -228,14 +227,14 @@ def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Gen
     wanted = missing = cells(length)
     values = np.array([parameters[name] for name in _NAMES[kind]], float)
     bits, number = random.address(rng), 0
-    counts, levels = np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing)
+    runs = Runs(np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing))
     while True:
-        number, missing = _draw_features(kind, missing, number, values, bits, counts, levels)
+        number, missing = _draw_features(kind, missing, number, values, bits, runs)
         if missing <= 0:
             break
-        counts, levels = np.resize(counts, 2 * len(counts)), np.resize(levels, 2 * len(levels))
+        runs = Runs(*(np.resize(array, 2 * len(array)) for array in runs))
     heights, vertical = np.empty(wanted - missing), np.empty(wanted - missing, bool)
-    _spread(number, counts, levels, heights, vertical)
+    _spread(number, *runs, heights, vertical)
     return Profile(heights, vertical)
 
 
@@ -303,11 +302,7 @@ def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> P
 
 
 def _register_feature(name: str, kind: int, own: Mapping[str, Parameter], words: str) -> None:
-    """Registers a feature twice: on level ground and on rolling ground.
-
-    Args:
-      words: the feature, for the descriptions of both types.
-    """
+    """Registers a feature twice: on level ground and on rolling ground; `words` describe it."""
 
     def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _repeat(kind, parameters, length, rng)

@@ -91,13 +91,9 @@ def register_line(
 def draw(
     type_name: str, parameters: Parameters, length: float, rng: np.random.Generator
 ) -> Profile:
-    """Generates one stretch of ground, and checks the generator's result.
+    """Generates a stretch of ground of a nominal length, m, and checks the generator's result.
 
-    Args:
-      type_name: a key of GENERATORS.
-      parameters: a value for every parameter of the type, as from `Terrain.parameters`.
-      length: nominal length, m; generators overshoot by up to one feature.
-      rng: source of randomness.
+    `parameters` are those of `Terrain.parameters`.
     """
     check_known('terrain type', _generators, type_name)
     if not 0 < length <= LONGEST:

@@ -35,17 +35,13 @@ _FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # distance of two streams: 2**128 / g
 class Mark(NamedTuple):
     """Where two stretches meet, and all that the ground beyond depends on.
 
-    Attributes:
-      number: 0 at the centre, 1, 2, ... to the right of it, -1, -2, ... to the left.
-      vertex: its vertex.
-      height: height of that vertex, m.
-      stream: state of the random generator from which the next stretch away from the centre is
-        drawn; None before it is drawn, at the centre, and for level ground.
+    The next stretch away from the centre is drawn from `stream`, the state of a random generator.
+    It is None before that, at the centre, and for level ground.
     """
 
-    number: int
+    number: int  # 0 at the centre, 1, 2, ... to the right of it, -1, -2, ... to the left
     vertex: int
-    height: float
+    height: float  # of the vertex, m
     stream: dict[str, Any] | None
 
 
@@ -109,18 +105,19 @@ class PlanarGround:
         if not abs(centre) <= LONGEST:
             raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
         vertex = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
-        self._begin(
-            terrain.type, terrain.parameters(terrain_level), seed_sequence(seed),
-            Mark(0, vertex, 0.0, None),
-        )  # fmt: skip
+        parameters, sequence = terrain.parameters(terrain_level), seed_sequence(seed)
+        self._begin(terrain.type, parameters, sequence, vertex)
 
     def _begin(
-        self, type_: str, parameters: Mapping[str, float], sequence: np.random.SeedSequence,
-        centre: Mark,
-    ) -> None:  # fmt: skip
+        self,
+        type_: str,
+        parameters: Mapping[str, float],
+        sequence: np.random.SeedSequence,
+        centre: int,
+    ) -> None:
         self.type: str = type_
         self.parameters: dict[str, float] = dict(parameters)
-        self._sequence, self._centre = sequence, centre
+        self._sequence, self._centre = sequence, Mark(0, centre, 0.0, None)
         # Random streams of the ground to the right and to the left, created on demand, and the numbers
         # of the marks from which they draw next.
         self._streams: list[np.random.Generator | None] = [None, None]
@@ -129,7 +126,7 @@ class PlanarGround:
         span = self.parameters['StartSpan'] if self._line is not None else 0.0
         if span:
             self._offset = float(np.random.default_rng(sequence).uniform(-span, span))
-        self._start(centre)
+        self._start(self._centre)
         if self._line is not None:
             self._low, self._heights = 0, self._on_line(0, 1)
 
@@ -222,15 +219,13 @@ class PlanarGround:
         ground.__setstate__(state)
         return ground
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.state()
-
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
-        centre = Mark(0, state['centre'], 0.0, None)
-        self._begin(state['type'], state['parameters'], sequence, centre)
+        self._begin(state['type'], state['parameters'], sequence, state['centre'])
         if state['mark'] is not None:
             self._start(Mark(*state['mark']))
+
+    __getstate__ = state
 
     @property
     def _line(self) -> Callable[[np.ndarray], np.ndarray] | None:

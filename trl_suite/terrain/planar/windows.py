@@ -22,18 +22,13 @@ _CELLS_PER_METRE = 1 / SPACING
 class PlanarWindows(NamedTuple):
     """Windows of W = `VERTICES` vertices, SPACING apart, of n grounds; arrays are never replaced.
 
-    Attributes:
-      start: index of the vertex at which the boxes of a window begin, `BEFORE` vertices after its
-        first one, (n,); NaN before the first episode.
-      heights: heights of the vertices, (n, W) m.
-      rises: from each vertex to the next, (n, W) m; the last is 0.
-      vertical: whether the cell before a vertex is a vertical face, (n, W) bool.
+    The boxes of a window begin `BEFORE` vertices after its first one.
     """
 
-    start: np.ndarray
-    heights: np.ndarray
-    rises: np.ndarray
-    vertical: np.ndarray
+    start: np.ndarray  # (n,); index of the vertex where boxes begin; NaN before the first episode
+    heights: np.ndarray  # (n, W) m
+    rises: np.ndarray  # (n, W) m; from each vertex to the next; the last is 0
+    vertical: np.ndarray  # (n, W) bool; whether the cell before a vertex is a vertical face
 
 
 def empty(n: int) -> PlanarWindows:

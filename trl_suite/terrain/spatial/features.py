@@ -77,9 +77,10 @@ CONVEYORS = {
 }
 # Parameters without effect, by type; in the original only those of belts have an effect.
 IDLE = {
-    'trail3d': ('PathLength', 'PathTurnLength'), 'var3d_stairs': ('StepSpacingMin', 'StepSpacingMax'),
+    'trail3d': ('PathLength', 'PathTurnLength'),
+    'var3d_stairs': ('StepSpacingMin', 'StepSpacingMax'),
     'conveyor3d': ('ConveyorNumSlices',),
-}  # fmt: skip
+}
 
 Corner = np.ndarray | tuple[float, float]
 Rectangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # low and high corners, heights
@@ -331,10 +332,8 @@ def _meeting(
     """
     count = 0
     for k in range(len(begin)):
-        if (
-            begin[k, 0] <= high_x and begin[k, 1] <= high_y
-            and end[k, 0] >= low_x and end[k, 1] >= low_y
-        ):  # fmt: skip
+        begins = begin[k, 0] <= high_x and begin[k, 1] <= high_y
+        if begins and end[k, 0] >= low_x and end[k, 1] >= low_y:
             if numbers is None:
                 return 1
             numbers[count] = k

@@ -47,10 +47,7 @@ def register3d(
 def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> Layout:
     """Generates the ground of an episode, and checks the generator's result.
 
-    Args:
-      type_name: a key of GENERATORS3D.
-      parameters: a value for every parameter of the type, as from `Terrain.parameters`.
-      rng: source of randomness.
+    `parameters` are those of `Terrain.parameters`.
     """
     check_known('three-dimensional terrain type', _generators, type_name)
     layout = _generators[type_name].function(parameters, rng)

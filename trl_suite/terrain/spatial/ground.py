@@ -47,18 +47,7 @@ class SpatialGround:
         *,
         terrain_level: float = 0.0,
     ) -> None:
-        """Generates the ground.
-
-        Args:
-          terrain: the type and parameters of the ground; three-dimensional.
-          seed: an integer, a SeedSequence (not changed: the same one gives the same ground), or a
-            Generator (from which four numbers are drawn).
-          terrain_level: number of the parameter set, see `Terrain.parameters`.
-
-        Raises:
-          ValueError: planar terrain, or a terrain_level that is not a number.
-          TypeError: the seed has another type.
-        """
+        """Generates the ground; arguments and errors are those of a `PlanarGround`."""
         if not terrain.spatial:
             raise ValueError(
                 f'terrain {terrain.name!r} ({terrain.type}) is planar; a SpatialGround needs '

@@ -24,13 +24,9 @@ from trl_suite.util.compiled import compiled
 
 
 def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialWindows) -> None:
-    """Replaces the boxes and belts of a window.
+    """Replaces the boxes and belts of window i, whose centre is set already.
 
-    Args:
-      i: index of the window, whose centre is set already.
-      boxes: those that touch the window, at most as many as were allocated.
-      belts: all belts.
-      ground: the windows.
+    There are at most as many boxes as were allocated.
     """
     ground.boxes[i, :, HALF_X] = -1.0
     _put(i, 0, boxes, ground)

@@ -11,12 +11,15 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from numbers import Real
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from trl_suite.util.compiled import compiled
+
+if TYPE_CHECKING:
+    from trl_suite.terrain.spatial.trail import Trail
 
 GRID = 0.2  # m between the vertices of a height grid; vertex i is at i * GRID
 TURN_DISTANCE = 5.0  # m; moving boxes reverse only at a larger distance from the character
@@ -106,10 +109,8 @@ def _touching(
         cosine, sine = abs(math.cos(yaw[k])), abs(math.sin(yaw[k]))
         length, width = half_size[k, 0], half_size[k, 1]
         along, across = cosine * length + sine * width, sine * length + cosine * width
-        found[k] = (
-            x + along >= low_x and y + across >= low_y
-            and x - along <= high_x and y - across <= high_y
-        )  # fmt: skip
+        reaches = x + along >= low_x and y + across >= low_y
+        found[k] = reaches and x - along <= high_x and y - across <= high_y
 
 
 NO_BOXES = boxes(np.zeros((0, 2)), (0, 0), 0)
@@ -144,21 +145,6 @@ class Movers(NamedTuple):
         way = self.end - self.start
         way[self.length < 1e-9] = 1, 0
         return way / np.linalg.norm(way, axis=1)[:, None]
-
-
-class Trail(Protocol):
-    """A path of straight segments, extended on demand."""
-
-    width: np.ndarray  # (k,) of the existing segments
-    start: np.ndarray  # (k, 2)
-    end: np.ndarray  # (k, 2)
-    heading: np.ndarray  # (k,) rad
-
-    def extend(self, count: int) -> None:
-        """Extends the trail to at least `count` segments."""
-
-    def leave(self, half_side: float) -> int:
-        """Number of segments up to the first that ends outside a square around the origin."""
 
 
 class Grid(NamedTuple):
@@ -214,7 +200,8 @@ class Layout:
         the same arguments, a faster test whether there are any.
       belts: conveyor belts.
       movers: moving boxes; they stand on the level.
-      trail: the path of start places and goals, if place is 'trail'.
+      trail: the path of start places and goals, if place is 'trail'; other objects need the
+        attributes of a `Trail` but its height, and the methods `extend` and `leave`.
       place: where characters start and where goals are: 'start' (at the origin; goals near the
         character), 'clear' (anywhere that is clear of boxes and belts), or 'trail'.
       span: for 'clear', half side of the square of start places and goals, m.

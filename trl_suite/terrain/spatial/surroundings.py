@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from trl_suite.terrain.spatial.layout import GRID, NO_BOXES, Boxes, Layout
 from trl_suite.terrain.spatial.windows import (
     DEPTH,
     HALF,
-    SAMPLES,
     SHIFT,
     VERTICES,
     Capacity,
@@ -70,13 +69,13 @@ def _parts(layout: Layout) -> Capacity:
 class Surroundings:
     """Windows of n grounds, 32 m x 32 m around each character, for queries over a batch axis.
 
-    A query covers all characters at once. Within the window its result equals that of
-    `SpatialGround`; beyond the window, that of the nearest point of its rim. `recentre` keeps every
-    character near enough to the centre that its height map lies inside the window.
+    Within a window, results of queries equal those of `SpatialGround`; beyond it, those of the
+    nearest point of its rim. `recentre` keeps every character near enough to the centre that its
+    height map lies inside the window.
 
     Attributes:
       arrays: the windows, for the compiled functions of one simulation in
-        `trl_suite.terrain.spatial.windows`.
+        `trl_suite.terrain.spatial.windows`, such as `height_map` and `velocity_map`.
       pack: the same as one argument, see `trl_suite.util.compiled.packed`.
       grounds: grounds of each character.
       boxes: boxes of each window, sorted by x.
@@ -152,60 +151,16 @@ class Surroundings:
         moved = ground.mover_distance[env_ids][..., None] * ground.mover_axis[env_ids]
         return ground.mover_start[env_ids] + moved
 
-    # Queries.
-
     def height(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Heights of the surface at points (simulations, k), m."""
-        return self._ask(_heights, env_ids, *np.shape(x)[-1:], x=x, y=y)
-
-    def velocity(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
-        """Horizontal surface velocities at points (simulations, k), m/s, (simulations, k, 2)."""
-        return self._ask(_velocities, env_ids, *np.shape(x)[-1:], 2, x=x, y=y)
-
-    def height_map(self, xy: np.ndarray, heading: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
-        """Heights around characters, relative to the surface under them.
-
-        32 x 32 samples in the heading frame: from 1 m behind to 10 m ahead, 5.5 m to each side,
-        0.355 m apart. Sample 32 v + u is the u-th from behind of the v-th line from the left.
-
-        Args:
-          xy: positions of the characters, m, (simulations, 2).
-          heading: rad, (simulations,).
-          env_ids: indices of the simulations.
-
-        Returns:
-          Heights in m, (simulations, 1024).
-        """
-        return self._ask(_height_maps, env_ids, SAMPLES**2, xy=xy, heading=heading)
-
-    def velocity_map(
-        self, xy: np.ndarray, heading: np.ndarray, env_ids: EnvIds = ALL
-    ) -> np.ndarray:
-        """Velocities of the surface around characters, relative to the surface under them.
-
-        Arguments are those of `height_map`.
-
-        Returns:
-          Velocities in m/s, (simulations, 2048): components along the heading at the samples of a
-          height map, then components to the right of it.
-        """
-        return self._ask(_velocity_maps, env_ids, 2 * SAMPLES**2, xy=xy, heading=heading)
-
-    def _ask(
-        self, query: Callable[..., None], env_ids: EnvIds, *size: int, **places: Any
-    ) -> np.ndarray:
-        """Calls a compiled loop over simulations; returns its result, (simulations, *size)."""
         env_ids = self._all_ids[env_ids]
-        arrays = {name: np.ascontiguousarray(each, float) for name, each in places.items()}
-        expected = {'x': size[:1], 'y': size[:1], 'xy': (2,), 'heading': ()}
-        for name, array in arrays.items():
-            if array.shape != (shape := (len(env_ids), *expected[name])):
+        x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
+        for name, array in (('x', x), ('y', y)):
+            if array.shape != (shape := (len(env_ids), *np.shape(x)[-1:])):
                 raise ValueError(f'{name} has shape {array.shape}; expected {shape}')
-        out = np.empty((len(env_ids), *size))
-        query(env_ids, *arrays.values(), self.pack, out)
+        out = np.empty(x.shape)
+        _heights(env_ids, x, y, self.pack, out)
         return out
-
-    # State.
 
     def state(self, env_id: int) -> dict[str, Any]:
         """Returns the state from which `restore` restores the surroundings of one character."""
@@ -264,37 +219,3 @@ def _heights(
     for k in range(len(env_ids)):
         for p in range(x.shape[1]):
             out[k, p] = spatial_ground.height(env_ids[k], x[k, p], y[k, p], ground)
-
-
-@compiled
-def _velocities(
-    env_ids: np.ndarray, x: np.ndarray, y: np.ndarray, ground: SpatialWindows, out: np.ndarray
-) -> None:
-    for k in range(len(env_ids)):
-        for p in range(x.shape[1]):
-            east, north = spatial_ground.velocity(env_ids[k], x[k, p], y[k, p], ground)
-            out[k, p, 0], out[k, p, 1] = east, north
-
-
-@compiled
-def _height_maps(
-    env_ids: np.ndarray,
-    xy: np.ndarray,
-    heading: np.ndarray,
-    ground: SpatialWindows,
-    out: np.ndarray,
-) -> None:
-    for k in range(len(env_ids)):
-        spatial_ground.height_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])
-
-
-@compiled
-def _velocity_maps(
-    env_ids: np.ndarray,
-    xy: np.ndarray,
-    heading: np.ndarray,
-    ground: SpatialWindows,
-    out: np.ndarray,
-) -> None:
-    for k in range(len(env_ids)):
-        spatial_ground.velocity_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])

@@ -62,45 +62,26 @@ class SpatialWindows(NamedTuple):
 
     Arrays of parts that a terrain does not have are of length 0 along their second axis. The arrays
     are changed in place and never replaced.
-
-    Attributes:
-      level: level of the plane; if there is none, a surface DEPTH below all parts, (n,) m.
-      centre: centres of the windows, (n, 2) m.
-      grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
-      boxes: values in the columns above, (n, B, 8); HALF_X is -1 where there is no box.
-      box_velocity: velocity of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
-      bins: begin and end of each bin in bin_boxes, (n, bins along x, along y, 2) int32.
-      bin_boxes: for every bin the indices of the boxes that touch it, (n, k) int32.
-      mover_start: where the path of a moving box starts, (n, M, 2) m.
-      mover_axis: unit vector along the path, (n, M, 2).
-      mover_length: length of the path, (n, M) m.
-      mover_half_size: (n, M, 2) m; -1 where there is no box.
-      mover_top: (n, M) m.
-      mover_speed: (n, M) m/s.
-      mover_distance: from the start of the path, (n, M) m; changes as boxes move.
-      mover_direction: 1 towards the end of the path, -1 towards its start, (n, M).
-      mover_begin: distance from the start of the path at joint position 0, (n, M) m.
-      mover_qpos, mover_dof: addresses of these joints in the physics, (M,).
     """
 
-    level: np.ndarray
-    centre: np.ndarray
-    grid: np.ndarray
-    boxes: np.ndarray
-    box_velocity: np.ndarray
-    bins: np.ndarray
-    bin_boxes: np.ndarray
-    mover_start: np.ndarray
-    mover_axis: np.ndarray
-    mover_length: np.ndarray
-    mover_half_size: np.ndarray
-    mover_top: np.ndarray
-    mover_speed: np.ndarray
-    mover_distance: np.ndarray
-    mover_direction: np.ndarray
-    mover_begin: np.ndarray
-    mover_qpos: np.ndarray
-    mover_dof: np.ndarray
+    level: np.ndarray  # (n,) m; of the plane, or of a surface DEPTH below all parts
+    centre: np.ndarray  # (n, 2) m
+    grid: np.ndarray  # (n, VERTICES**2) m, single precision; vertices along x, then along y
+    boxes: np.ndarray  # (n, B, 8); the columns above; HALF_X is -1 where there is no box
+    box_velocity: np.ndarray  # (n, B, 2) m/s; of belts; (n, 0, 2) if there are none
+    bins: np.ndarray  # (n, bins along x, along y, 2) int32; begin and end of each in bin_boxes
+    bin_boxes: np.ndarray  # (n, k) int32; for every bin the indices of the boxes that touch it
+    mover_start: np.ndarray  # (n, M, 2) m; where the path of a moving box starts
+    mover_axis: np.ndarray  # (n, M, 2); unit vector along the path
+    mover_length: np.ndarray  # (n, M) m; of the path
+    mover_half_size: np.ndarray  # (n, M, 2) m; -1 where there is no box
+    mover_top: np.ndarray  # (n, M) m
+    mover_speed: np.ndarray  # (n, M) m/s
+    mover_distance: np.ndarray  # (n, M) m; from the start of the path; changes as boxes move
+    mover_direction: np.ndarray  # (n, M); 1 towards the end of the path, -1 towards its start
+    mover_begin: np.ndarray  # (n, M) m; distance from the start of the path at joint position 0
+    mover_qpos: np.ndarray  # (M,); addresses of the joints in the physics
+    mover_dof: np.ndarray  # (M,)
 
 
 def empty(n: int, capacity: Capacity) -> SpatialWindows:
@@ -152,7 +133,8 @@ def height_map(
 ) -> None:
     """Writes heights around a character, relative to the surface under it.
 
-    Sample 32 v + u is the u-th from behind of the v-th line from the left; see `Surroundings`.
+    32 x 32 samples in the heading frame: from 1 m behind to 10 m ahead, 5.5 m to each side,
+    0.355 m apart. Sample 32 v + u is the u-th from behind of the v-th line from the left.
 
     Args:
       i: index of the simulation.
