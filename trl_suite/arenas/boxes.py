@@ -36,19 +36,12 @@ class Boxes(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """The pieces of a profile of m vertices, in order of x; the first `number` entries are used.
-
-    Attributes:
-      number: number of pieces.
-      level: whether all of them are level.
-      ends: indices of the first and the last vertex of each, (2, m).
-      edges: x and z of the left and of the right edge of upper faces, m, then their slopes, (5, m).
-    """
+    """The pieces of a profile of m vertices, in order of x; the first `number` entries are used."""
 
     number: int
-    level: bool
-    ends: np.ndarray
-    edges: np.ndarray
+    level: bool  # whether all of them are level
+    ends: np.ndarray  # (2, m); indices of the first and the last vertex of each
+    edges: np.ndarray  # (5, m); of upper faces, x, z of the left and of the right edge, m; slopes
 
 
 def cut(

@@ -9,7 +9,7 @@ from dm_control import composer
 
 from trl_suite.arenas import boxes, scene
 from trl_suite.arenas.boxes import Boxes
-from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas.scene import CONTACTS, PARKED
 from trl_suite.engine import World
 from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
 from trl_suite.terrain.planar import windows as planar_ground
@@ -52,10 +52,8 @@ class PlanarArena(composer.Arena):
         scene.paint(root, 'ground', look.ground, 2, mark='edge', markrgb=edge)
         # A default class, since formatting the attributes of each box takes most of the time.
         ground_class = root.default.add('default', dclass='ground')
-        ground_class.geom.set_attributes(
-            type='box', size=(0.1, boxes.HALF_WIDTH, 0.1), friction=FRICTION, solref=SOLREF,
-            solimp=SOLIMP, condim=3, material='ground',
-        )  # fmt: skip
+        shape = {'type': 'box', 'size': (0.1, boxes.HALF_WIDTH, 0.1), 'material': 'ground'}
+        ground_class.geom.set_attributes(**shape, **CONTACTS)
         self.boxes = [
             # In the world body: the engine tests all geoms of any other body in every substep.
             # Spread along x, so that the compiler's bounding volumes are useful.

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from dm_control import composer, mjcf
 
 from trl_suite.arenas import scene
-from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas.scene import CONTACTS, PARKED
 from trl_suite.engine import World
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
 from trl_suite.terrain.spatial.ground import Random
@@ -65,58 +65,39 @@ class SpatialArena(composer.Arena):
         # Parts of the ground do not collide with each other: moving boxes pass through them.
         # A default class, since formatting the attributes of each box takes most of the time.
         ground_class = root.default.add('default', dclass='ground')
-        ground_class.geom.set_attributes(
-            type='box', size=(SIZE,) * 3, friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
-            condim=3, contype=1, conaffinity=0,
-        )  # fmt: skip
+        masks = {'contype': 1, 'conaffinity': 0}
+        ground_class.geom.set_attributes(type='box', size=(SIZE,) * 3, **CONTACTS, **masks)
+
+        def add(body: mjcf.Element, name: str, material: str, **attributes: Any) -> mjcf.Element:
+            return body.add('geom', dclass=ground_class, name=name, material=material, **attributes)
+
         ground = root.worldbody.add('body', name='terrain')
         self.plane = self.field = None
         if holds.level:
-            self.plane = ground.add(
-                'geom',
-                dclass=ground_class,
-                name='plane',
-                type='plane',
-                size=(0, 0, 1),
-                material='ground',
-            )
+            self.plane = add(ground, 'plane', 'ground', type='plane', size=(0, 0, 1))
         if holds.grid:
-            root.asset.add(
-                'hfield', name='field', nrow=VERTICES, ncol=VERTICES,
-                size=(HALF, HALF, ELEVATION, BASE),
-            )  # fmt: skip
-            self.field = ground.add(
-                # Rotated by 90 degrees, so that cells are split into triangles from back left to
-                # front right, as in queries; a row of data is then along y, the first one ahead.
-                'geom', dclass=ground_class, name='field', type='hfield', hfield='field',
-                material='ground', quat=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)),
-            )  # fmt: skip
+            size = (HALF, HALF, ELEVATION, BASE)
+            root.asset.add('hfield', name='field', nrow=VERTICES, ncol=VERTICES, size=size)
+            # Rotated by 90 degrees, so that cells are split into triangles from back left to front
+            # right, as in queries; a row of data is then along y, the first one ahead.
+            turn = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))
+            self.field = add(ground, 'field', 'ground', type='hfield', hfield='field', quat=turn)
         # Spread along x, so that the compiler's bounding volumes are useful.
+        world, block = root.worldbody, 'block' if holds.level else 'ground'
         self.boxes = [
-            root.worldbody.add(
-                'geom', dclass=ground_class, name=f'box_{i}', pos=(SIZE * i, 0, PARKED),
-                material='block' if holds.level else 'ground',
-            )
-            for i in range(holds.boxes)
-        ]  # fmt: skip
+            add(world, f'box_{i}', block, pos=(SIZE * i, 0, PARKED)) for i in range(holds.boxes)
+        ]
+        moving = (1, 0, 0, 0, 0, 0)  # the compiler enables surface velocities only if one is not 0
         self.belts = [
-            root.worldbody.add(
-                # The compiler enables surface velocities only if one is not 0.
-                'geom', dclass=ground_class, name=f'belt_{i}', pos=(SIZE * i, 1, PARKED),
-                surfacevel=(1, 0, 0, 0, 0, 0), material='belt',
-            )
+            add(world, f'belt_{i}', 'belt', pos=(SIZE * i, 1, PARKED), surfacevel=moving)
             for i in range(holds.belts)
-        ]  # fmt: skip
+        ]
         self.movers = []
         for i in range(holds.movers):
             body = ground.add('body', name=f'mover_{i}', pos=(SIZE * i, 2, PARKED))
-            body.add(
-                'joint', name=f'mover_{i}', type='slide', axis=(1, 0, 0), limited=False,
-                armature=DRIVE,
-            )  # fmt: skip
-            body.add(
-                'geom', dclass=ground_class, name=f'mover_{i}', mass=1, material='mover',
-            )  # fmt: skip
+            slide = {'type': 'slide', 'axis': (1, 0, 0), 'limited': False, 'armature': DRIVE}
+            body.add('joint', name=f'mover_{i}', **slide)
+            add(body, f'mover_{i}', 'mover', mass=1)
             self.movers.append(body)
         self._physics: Any = None
 
@@ -326,9 +307,13 @@ class SpatialArena(composer.Arena):
 
 @compiled
 def _keep_moving(
-    env_ids: np.ndarray, xy: np.ndarray, qpos: np.ndarray, qvel: np.ndarray,
-    ground: SpatialWindows, sped: np.ndarray,
-) -> None:  # fmt: skip
+    env_ids: np.ndarray,
+    xy: np.ndarray,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    ground: SpatialWindows,
+    sped: np.ndarray,
+) -> None:
     for k in range(len(env_ids)):
         sped[k] = keep_moving(env_ids[k], xy[k, 0], xy[k, 1], qpos, qvel, ground)
 
@@ -344,10 +329,8 @@ def _pose(model: mujoco.MjModel, first: int, boxes: Boxes, level: float | None) 
     """Poses geoms so that their upper faces are those of boxes."""
     # By NumPy: the compiled function may differ in the last bit.
     angle = np.arctan(boxes.slope) if boxes.slope.any() else boxes.slope
-    _write_boxes(
-        *boxes[:4], angle, np.nan if level is None else level, first, SHADES, model.geom_pos,
-        model.geom_size, model.geom_quat, model.geom_rgba,
-    )  # fmt: skip
+    geoms = model.geom_pos, model.geom_size, model.geom_quat, model.geom_rgba
+    _write_boxes(*boxes[:4], angle, np.nan if level is None else level, first, SHADES, *geoms)
 
 
 @compiled

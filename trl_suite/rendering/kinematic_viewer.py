@@ -50,12 +50,8 @@ class KinematicViewer:
         stage.prepare(root)
         root.visual.map.shadowclip = SHADOWS
         root.visual.quality.shadowsize = 4096
-        checker = {'type': '2d', 'builtin': 'checker', 'width': 256, 'height': 256}
-        colours = {'rgb1': (0.47, 0.52, 0.44), 'rgb2': (0.42, 0.47, 0.40)}
-        tiles = {'texuniform': True, 'texrepeat': (0.5 / TILE, 0.5 / TILE)}
+        stage.paint(root, 'floor', stage.OLIVE.ground, 0.5 / TILE)
         box = {'type': 'box', 'size': (FLOOR, FLOOR, 1), 'pos': (0, 0, -1)}
-        root.asset.add('texture', name='floor', **checker, **colours)
-        root.asset.add('material', name='floor', texture='floor', specular=0, **tiles)
         root.worldbody.add('geom', name='floor', material='floor', **box)
         self.character = figure = characters.make(character)
         root_joints = figure.create_root_joints(arena.attach(figure))
