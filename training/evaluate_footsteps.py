@@ -15,7 +15,6 @@ import argparse
 import dataclasses
 import json
 import pathlib
-import types
 from typing import Any
 
 import numpy as np
@@ -72,9 +71,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 def row_for(id_: str, terrain: Any) -> EnvSpec:
     spec = suite.find(id_)
     options = {k: v for k, v in spec.options.items() if k != 'plans'}
-    return dataclasses.replace(
-        spec, terrain=terrain or spec.terrain, options=types.MappingProxyType(options)
-    )
+    return dataclasses.replace(spec, terrain=terrain or spec.terrain, options=options)
 
 
 def run(

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Callable, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -78,7 +77,7 @@ class Bench:
         spec = EnvSpec(
             id=f'{character}/gait/{terrain}/tuning', domain='custom', task='tuning',
             character=character, actuation='gait', terrain=terrain, task_type='gait',
-            options=MappingProxyType({'start_noise': START_NOISE}), description='Gaits are measured.',
+            options={'start_noise': START_NOISE}, description='Gaits are measured.',
         )  # fmt: skip
         self.environments = VectorEnvironment(spec, num_envs, 1, seed=0)
         task = self.environments.task
