@@ -16,7 +16,6 @@ except (AttributeError, ImportError) as error:
     raise RuntimeError(no_gl(error)) from error
 
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 from trl_suite import actuation as actuation_models
@@ -199,9 +198,9 @@ def combine(
         terrain=ground,
         task_type=title if type_ is None else type_.name,
         clip=clip,
-        options=MappingProxyType({} if type_ is None else dict(type_.options)),
+        options={} if type_ is None else dict(type_.options),
         description='A user-defined combination.',
-        own=MappingProxyType(own),
+        own=own,
     )
     return spec.with_terrain(terrain)
 

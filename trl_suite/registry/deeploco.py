@@ -5,54 +5,62 @@ Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 
 from __future__ import annotations
 
-from types import MappingProxyType
+import dataclasses
 from typing import Any
 
 from trl_suite.registry.spec import EnvSpec
+
+_FIELDS = {field.name for field in dataclasses.fields(EnvSpec)}
+
+
+def _spec(tags: tuple[str, ...], original: bool = True, **given: Any) -> EnvSpec:
+    """Returns a spec; what is given and is no field of it is an option of the task."""
+    options = {name: given.pop(name) for name in [*given] if name not in _FIELDS}
+    return EnvSpec(
+        domain='deeploco',
+        actuation='position',
+        options=options,
+        tags=frozenset({*tags, 'original' if original else 'completion'}),
+        **given,
+    )
+
+
+_MADE = (
+    'the 27 reference steps were made for this suite; the original has 14 from motion capture',
+)
 
 
 def _step(
     id_: str,
     task: str,
     words: str,
-    *,
     character: str = 'biped3d_mocap',
     preset: str = 'plane',
-    original: bool = True,
-    aliases: tuple[str, ...] = (),
-    differences: tuple[str, ...] = (
-        'the 27 reference steps were made for this suite; the original has 14 from motion capture',
-    ),
-    **options: Any,
+    **given: Any,
 ) -> EnvSpec:
-    return EnvSpec(
+    return _spec(
+        ('spatial',),
         id=id_,
-        domain='deeploco',
         task=task,
         character=character,
-        actuation='position',
         terrain=preset,
         task_type='spatial_footsteps',
         clip=character,
-        options=MappingProxyType(options),
         description=f'The 3D biped {words}.',
-        differences=differences,
-        tags=frozenset({'spatial', 'original' if original else 'completion'}),
-        aliases=aliases,
+        **{'differences': _MADE, **given},
     )
 
 
-_STEP2D = EnvSpec(
+_STEP2D = _spec(
+    ('planar', 'flat'),
+    original=False,
     id='PD_Biped2D_LLC_Flat_Step-v0',
-    domain='deeploco',
     task='llc_flat_step',
     character='biped2d_full',
-    actuation='position',
     terrain='flat',
     task_type='planar_footsteps',
     clip='biped2d_full_walk',
     description='The biped with arms walks straight ahead along planned footsteps on flat ground.',
-    tags=frozenset({'planar', 'flat', 'completion'}),
 )
 
 _STEPS = (
@@ -98,27 +106,25 @@ RUN_LIMIT = 667  # the same for running, where a footstep lasts 0.3 s
 
 
 def _hike(
-    name: str, preset: str, words: str, *, character: str = 'biped3d_mocap', original: bool = True,
-    task_type: str = 'goal_navigation', limit: int = PLAN_LIMIT, aliases: tuple[str, ...] = (), rate: int = 1200, differences: tuple[str, ...] = (), **options: Any,
-) -> EnvSpec:  # fmt: skip
-    return EnvSpec(
+    name: str,
+    preset: str,
+    words: str,
+    character: str = 'biped3d_mocap',
+    rate: int = 1200,
+    **given: Any,
+) -> EnvSpec:
+    physics = f'MuJoCo at 300 Hz instead of Bullet at {rate} Hz; see the option substeps'
+    differences = (physics, *given.pop('differences', ()))
+    return _spec(
+        ('spatial', 'hierarchical'),
         id=f'PD_Biped3D_HLC_{name}-v0',
-        domain='deeploco',
         task=f'hlc_{name.lower()}',
         character=character,
-        actuation='position',
         terrain=preset,
-        task_type=task_type,
         clip=character,
-        options=MappingProxyType(options),
         description=f'The 3D biped {words}; an action plans the next two footsteps.',
-        differences=(
-            f'MuJoCo at 300 Hz instead of Bullet at {rate} Hz; see the option substeps',
-            *differences,
-        ),
-        tags=frozenset({'spatial', 'hierarchical', 'original' if original else 'completion'}),
-        aliases=aliases,
-        step_limit=limit,
+        differences=differences,
+        **{'task_type': 'goal_navigation', 'step_limit': PLAN_LIMIT, **given},
     )
 
 
@@ -151,30 +157,23 @@ _HIKES = (
     _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', original=False),
     _hike(
         'PathFollowing_Run', 'trail3d_wide', 'runs along a wide trail between hills',
-        character='biped3d_mocap_run', original=False, limit=RUN_LIMIT,
+        character='biped3d_mocap_run', original=False, step_limit=RUN_LIMIT,
         controller='PD_Biped3D_LLC_Run_FootStep-v0', start_phases=_FROM_ZERO, step_length=1.0,
         target_speed=3.0, goal_reached=2.0,
     ),
 )  # fmt: skip
 
 
-def _hard(
-    name: str, preset: str, words: str, *, original: bool = True, task_type: str = 'direct_navigation',
-    aliases: tuple[str, ...] = (), **options: Any,
-) -> EnvSpec:  # fmt: skip
-    return EnvSpec(
+def _hard(name: str, preset: str, words: str, **given: Any) -> EnvSpec:
+    return _spec(
+        ('spatial', 'flat_control'),
         id=f'PD_Biped3D_Terrain_{name}_Hard-v0',
-        domain='deeploco',
         task=f'{name.lower()}_hard',
         character='biped3d_mocap',
-        actuation='position',
         terrain=preset,
-        task_type=task_type,
         clip='biped3d_mocap_walk',
-        options=MappingProxyType(options),
         description=f'The 3D biped {words}, without hierarchy: an action sets PD targets, at 30 Hz.',
-        tags=frozenset({'spatial', 'flat_control', 'original' if original else 'completion'}),
-        aliases=aliases,
+        **{'task_type': 'direct_navigation', **given},
     )
 
 

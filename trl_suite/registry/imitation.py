@@ -5,7 +5,6 @@ Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import Any
 
 from trl_suite.registry.naming import GAITS, NAMES, status
@@ -48,7 +47,7 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec
         actuation=model,
         terrain='flat',
         clip=clip,
-        options=MappingProxyType(options),
+        options=options,
         differences=differences,
         description=f'The {figure} tracks a {GAITS[clip]} on flat ground with {BY[model]}.',
         tags=frozenset({'planar', 'flat', status(id_, original)}),
@@ -93,7 +92,7 @@ def _spatial(
             ),
         ),
         clip=clip,
-        options=MappingProxyType(options),
+        options=options,
         description=f'The 3D biped tracks a {gait} straight ahead over {words} with PD targets{view}.',
         tags=frozenset({'spatial', 'original' if original else 'completion'}),
     )
@@ -101,23 +100,22 @@ def _spatial(
 
 SPECS = (
     *(
-        _imitation(character, model, clip, original=model != 'velocity')
-        for character, clips in (
-            ('biped2d', ('biped2d_walk', 'biped2d_walk')),
-            ('dog', ('dog_bound', 'dog_bound')),
+        _imitation(
+            character, model, first if model == 'position' else other, original=model != 'velocity'
+        )
+        for character, first, other in (
+            ('biped2d', 'biped2d_walk', 'biped2d_walk'),
+            ('dog', 'dog_bound', 'dog_bound'),
             # For the raptor, the original tracks one run with PD control and another otherwise.
-            ('raptor', ('raptor_run_050', 'raptor_run_066')),
+            ('raptor', 'raptor_run_050', 'raptor_run_066'),
         )
-        for model, clip in (
-            ('position', clips[0]), ('torque', clips[1]), ('muscle', clips[1]),
-            ('velocity', clips[1]),
-        )
+        for model in PREFIX
     ),
     _imitation('biped2d', 'position', 'biped2d_run', original=False),
     _imitation('biped2d', 'muscle', 'biped2d_run', original=False),
     *(_spatial(*terrain) for terrain in _SPATIAL_TERRAINS),
     # The original does not observe the terrain in these environments.
-    *(_spatial(*terrain[:3], False, terrain_observation='height') for terrain in _SPATIAL_TERRAINS[1:]),
+    *(_spatial(*each[:3], False, terrain_observation='height') for each in _SPATIAL_TERRAINS[1:]),
     _spatial('Track', 'plane', 'flat ground', True, reference_observation=True),
     _spatial('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
-)  # fmt: skip
+)

@@ -5,8 +5,6 @@ Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 from trl_suite.registry.naming import GAITS, NAMES, status
 from trl_suite.registry.spec import EnvSpec
 
@@ -38,7 +36,7 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> E
         actuation='position',
         terrain=preset,
         clip=clip,
-        options=MappingProxyType({} if blind else {'terrain_observation': SAMPLES}),
+        options={} if blind else {'terrain_observation': SAMPLES},
         description=f'The {figure} tracks a {GAITS[clip]} over {words}, {view}.',
         tags=frozenset({'planar', status(id_, True), *(['blind'] if blind else [])}),
     )

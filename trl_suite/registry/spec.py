@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from trl_suite import terrain as terrains
 
 STEP_LIMIT = 256  # steps after which an episode is truncated
-_MAPPINGS = ('options', 'own')
-
-
-def _empty() -> Mapping[str, Any]:
-    return MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,16 +44,12 @@ class EnvSpec:
     description: str
     task_type: str = 'planar_imitation'
     clip: str | None = None
-    options: Mapping[str, Any] = dataclasses.field(default_factory=_empty)
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     tags: frozenset[str] = frozenset()
     aliases: tuple[str, ...] = ()
     step_limit: int = STEP_LIMIT
     differences: tuple[str, ...] = ()
-    own: Mapping[str, Any] = dataclasses.field(default_factory=_empty)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _spec, ({**values, **{name: dict(values[name]) for name in _MAPPINGS}},)
+    own: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def part(self, name: str) -> Any:
         """Returns the custom object for a field if there is one, otherwise the field's name."""
@@ -75,8 +65,4 @@ class EnvSpec:
             own['terrain'] = terrains.load(terrain)
         if not isinstance(terrain, str):
             terrain = 'terrain'
-        return dataclasses.replace(self, terrain=terrain, own=MappingProxyType(own))
-
-
-def _spec(values: dict[str, Any]) -> EnvSpec:
-    return EnvSpec(**{**values, **{name: MappingProxyType(values[name]) for name in _MAPPINGS}})
+        return dataclasses.replace(self, terrain=terrain, own=own)
