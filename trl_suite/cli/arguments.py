@@ -17,13 +17,9 @@ Run = Callable[[argparse.Namespace], int | None]
 def add_command(
     commands: Any, name: str, text: str, run: Run | None = None
 ) -> argparse.ArgumentParser:
-    """Adds a command.
+    """Adds a command to the result of `add_subparsers`.
 
-    Args:
-      commands: result of `add_subparsers`.
-      name: what users type.
-      text: what the command does, for the help.
-      run: function of the parsed arguments that does it, and returns the exit status or None.
+    `text` says what it does, and `run`, which returns the exit status or None, does it.
     """
     command = commands.add_parser(
         name,

@@ -30,11 +30,19 @@ OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
 TIMEOUT = 120.0  # s, for every process that is started
 # Packages of the extras, by the name under which they are imported.
 EXTRAS = {
-    'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'viewer': ('viser',),
-    'gymnasium': ('gymnasium',), 'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',),
-    'rllib': ('ray',), 'cluster': ('ray', 'fsspec'), 'shimmy': ('shimmy',), 'train': ('torch',),
-    'tune': ('cma',), 'clips': ('pybvh',), 'minari': ('minari', 'h5py'),
-}  # fmt: skip
+    'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'),
+    'viewer': ('viser',),
+    'gymnasium': ('gymnasium',),
+    'sb3': ('stable_baselines3',),
+    'torchrl': ('torchrl',),
+    'rllib': ('ray',),
+    'cluster': ('ray', 'fsspec'),
+    'shimmy': ('shimmy',),
+    'train': ('torch',),
+    'tune': ('cma',),
+    'clips': ('pybvh',),
+    'minari': ('minari', 'h5py'),
+}
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',
     'osmesa': 'libosmesa6 (Debian, Ubuntu: apt install libosmesa6)',
@@ -86,17 +94,11 @@ print(json.dumps(found))
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """One line of the report."""
 
-    Attributes:
-      state: `OK`, `NOTE` (informative, not essential) or `FAILED`.
-      text: the finding.
-      remedy: what to do about it; may be empty.
-    """
-
-    state: str
+    state: str  # `OK`, `NOTE` (informative, not essential) or `FAILED`
     text: str
-    remedy: str = ''
+    remedy: str = ''  # what to do about it; may be empty
 
 
 def declare(commands: Any) -> None:
@@ -206,8 +208,7 @@ def backends() -> Iterator[tuple[str, Finding]]:
 def self_test(works: Sequence[str]) -> Iterator[Finding]:
     """Steps an environment for a second and renders it, with the current value of MUJOCO_GL.
 
-    Args:
-      works: values of MUJOCO_GL that can render.
+    `works` are the values that can render.
     """
     status, out, error = _end(_start(_RUN))
     if not out:  # if the chosen library is missing, importing dm_control fails
@@ -238,10 +239,12 @@ def _start(code: str, backend: str | None = None) -> subprocess.Popen[str]:
     if backend is not None:
         environment['MUJOCO_GL'] = backend
         environment.pop('PYOPENGL_PLATFORM', None)  # may be set for another library
-    return subprocess.Popen(
-        [sys.executable, '-W', 'ignore', '-c', _GUARD + code], env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    streams: Any = {
+        'stdin': subprocess.DEVNULL,
+        **dict.fromkeys(('stdout', 'stderr'), subprocess.PIPE),
+    }
+    command = [sys.executable, '-W', 'ignore', '-c', _GUARD + code]
+    return subprocess.Popen(command, env=environment, text=True, **streams)
 
 
 def _end(run: subprocess.Popen[str]) -> tuple[int, str, str]:

@@ -45,10 +45,11 @@ def run(arguments: argparse.Namespace) -> None:
     options = dict(arguments.options or ())
     if arguments.step_limit is not None:
         options['step_limit'] = arguments.step_limit
+    policy = baseline or acting.trained(arguments.policy, spec.id)
+    settings = arguments.episodes, arguments.seed, arguments.threads, options
     result = evaluation.evaluate(
-        spec, baseline or acting.trained(arguments.policy, spec.id), arguments.episodes, arguments.seed,
-        arguments.threads, options, factory=baseline is not None, progress=True,
-    )  # fmt: skip
+        spec, policy, *settings, factory=baseline is not None, progress=True
+    )
     result['policy'] = arguments.policy
     if arguments.json is not None:
         given = {'options': dict(arguments.options)} if arguments.options else {}

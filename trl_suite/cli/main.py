@@ -26,44 +26,18 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import importlib
 import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import trl_suite
-from trl_suite.cli import (
-    bench,
-    clip,
-    compile,
-    dataset,
-    doctor,
-    evaluate,
-    info,
-    list,
-    rollout,
-    sequences,
-    terrain,
-    try_file,
-    view,
-)
 from trl_suite.util import program
 
 # In the order of the help.
 COMMANDS = (
-    list,
-    info,
-    rollout,
-    view,
-    evaluate,
-    dataset,
-    terrain,
-    clip,
-    try_file,
-    doctor,
-    compile,
-    bench,
-    sequences,
+    'list info rollout view evaluate dataset terrain clip try_file doctor compile bench sequences'
 )
 
 
@@ -131,6 +105,6 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser = _Parser(prog=prog, description='Locomotion environments over random terrain.')
     parser.add_argument('--version', action='version', version=f'trl-suite {trl_suite.__version__}')
     commands = parser.add_subparsers(required=True, metavar='command', parser_class=_Parser)
-    for module in COMMANDS:
-        module.declare(commands)
+    for name in COMMANDS.split():
+        importlib.import_module(f'trl_suite.cli.{name}').declare(commands)
     return parser

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import re
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,8 +27,6 @@ if TYPE_CHECKING:
     import dm_env
 
     from trl_suite.environments.environment import Environment
-
-Stepping = Callable[[], contextlib.AbstractContextManager[None]]
 
 SHOWN_EPISODES = 8  # largest number of episodes that are printed
 _ENDS = ('fell', 'stuck', 'diverged')  # causes of an end of episode, in a task's info
@@ -67,6 +63,10 @@ def _size(text: str) -> tuple[int, int]:
 def run(arguments: argparse.Namespace) -> None:
     """Runs a policy, writes the requested files, and prints a line per episode and per file."""
     suite = engine.load()
+    import tqdm  # a dependency of dm_control
+
+    from trl_suite.evaluation import PROGRESS_DELAY
+
     options = dict(arguments.options or ())
     environment = suite.make(arguments.id, {**options, 'random': arguments.seed})
     policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
@@ -86,22 +86,25 @@ def run(arguments: argparse.Namespace) -> None:
         def picture() -> np.ndarray:
             return rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
 
-        def look(first: bool = False) -> None:
+        def look(first: bool) -> None:
             if video:
                 video.add(picture())
             if replay:
                 replay.add(jump=first)
 
-        stepping: Stepping = contextlib.nullcontext
-        if video or replay:
-            stepping = functools.partial(rendering.calling_each_frame, environment, look)
-        for done, time_step, action in _run(environment, policy, arguments.steps, stepping):
-            record.add(time_step, action)
-            if time_step.first():
-                look(first=True)
-            if arguments.strip is not None and done in in_strip:
-                in_strip.discard(done)  # the next reset has the same number
-                pictures.append(picture())
+        run = rendering.played(
+            environment, policy, arguments.steps, look if video or replay else None
+        )
+        # disable=None: no bar where stderr is not a terminal.
+        with tqdm.tqdm(
+            total=arguments.steps, delay=PROGRESS_DELAY, disable=None, unit='step'
+        ) as bar:
+            for done, time_step, action in run:
+                bar.update(done - bar.n)
+                record.add(time_step, action)
+                if arguments.strip is not None and done in in_strip:
+                    in_strip.discard(done)  # the next reset has the same number
+                    pictures.append(picture())
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
     if arguments.trajectory is not None:
@@ -113,35 +116,6 @@ def run(arguments: argparse.Namespace) -> None:
     for path in (arguments.video, arguments.html, arguments.strip, arguments.trajectory):
         if path is not None:
             print(path)
-
-
-def _run(
-    environment: Environment, policy: rendering.Policy, steps: int, stepping: Stepping
-) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
-    """Yields the number of steps, every time step, and its action: zeros at ends of episodes.
-
-    Steps are taken in contexts that `stepping` returns.
-    """
-    import tqdm  # a dependency of dm_control
-
-    from trl_suite.evaluation import PROGRESS_DELAY
-
-    none = np.zeros(len(environment.action_map))
-    time_step, done = environment.reset(), 0
-    # disable=None: no bar where stderr is not a terminal.
-    with tqdm.tqdm(total=steps, delay=PROGRESS_DELAY, disable=None, unit='step') as bar:
-        while True:
-            action = none if done == steps or time_step.last() else policy(time_step)
-            yield done, time_step, action
-            if done == steps:
-                return
-            if time_step.last():
-                time_step = environment.reset()
-            else:
-                with stepping():
-                    time_step = environment.step(action)
-                done += 1
-                bar.update()
 
 
 class _Record:
@@ -156,11 +130,10 @@ class _Record:
         environment = self._environment
         first = time_step.first()
         if self._keep:
-            self._rows.append((
-                np.concatenate([np.ravel(part) for part in time_step.observation.values()]), action,
-                0.0 if first else time_step.reward, 1.0 if first else time_step.discount,
-                int(time_step.step_type), environment.physics.data.qpos.copy(),
-            ))  # fmt: skip
+            parts = [np.ravel(part) for part in time_step.observation.values()]
+            outcome = (0.0, 1.0) if first else (time_step.reward, time_step.discount)
+            kind, qpos = int(time_step.step_type), environment.physics.data.qpos.copy()
+            self._rows.append((np.concatenate(parts), action, *outcome, kind, qpos))
         if first:
             self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'unfinished'})
             return

@@ -75,10 +75,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
     """Serves web browsers until an interrupt."""
-    engine.load('trl_suite.viewing.browser').Browser(
-        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options,
-        opened=_tell,
-    ).run()  # fmt: skip
+    shown = arguments.id, arguments.policy, arguments.seed
+    address = arguments.host, arguments.port
+    kind = engine.load('trl_suite.viewing.browser').Browser
+    kind(*shown, *address, options, opened=_tell).run()
 
 
 def _tell(viewer: Browser) -> None:
@@ -92,9 +92,7 @@ def check_screen() -> None:
     Raises:
       RuntimeError: there is no display, or GLFW cannot use it; the message has an alternative.
     """
-    if sys.platform == 'linux' and not (
-        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
-    ):
+    if not rendering.has_display():
         raise RuntimeError(
             'a window needs a display, but neither DISPLAY nor WAYLAND_DISPLAY is set; ' + INSTEAD
         )
@@ -113,16 +111,7 @@ def check_screen() -> None:
 
 
 def view(environment: Environment, policy: rendering.Policy, title: str) -> None:
-    """Shows an environment until the window is closed.
-
-    Args:
-      environment: the environment; it is reset.
-      policy: time step -> action.
-      title: title of the window.
-
-    Raises:
-      RuntimeError: no window can be opened.
-    """
+    """Resets an environment and shows it until the window is closed."""
     shown: Any = environment
     if hasattr(environment.task, 'watch'):
         from trl_suite.viewing.playback import Playback

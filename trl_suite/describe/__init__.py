@@ -27,9 +27,16 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
 __all__ = [
-    'Section', 'Table', 'differences_of', 'escape', 'markdown', 'markdown_table', 'parts', 'sections',
+    'Section',
+    'Table',
+    'differences_of',
+    'escape',
+    'markdown',
+    'markdown_table',
+    'parts',
+    'sections',
     'table',
-]  # fmt: skip
+]
 
 
 def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str]]:
@@ -47,9 +54,7 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
 def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
     """Yields sections of paragraphs and tables: all of `sections` except the differences.
 
-    Args:
-      spec: spec of the environment.
-      environment: built from it, or from a spec that differs only in its terrain.
+    The environment may be built from a spec that differs in its terrain.
     """
     type_, task = task_type(spec), environment.task
     if type_ is None:  # the task is made by a user's class or function

@@ -17,8 +17,8 @@ from trl_suite.util.tables import Section, Table, section
 
 def character(environment: Environment, joints: tuple[str, Iterable[object]]) -> Iterator[Section]:
     """Yields sections on a task's character and its links; `joints` is a column of the table."""
-    figure: Any = environment.task.character  # type: ignore[attr-defined]
-    spec = figure.spec
+    task: Any = environment.task
+    figure, spec = task.character, task.character.spec
     yield section(f'Character: {spec.name}', spec.description, figures(figure))
     yield section('Links', links(figure, environment.physics, joints))
 
@@ -40,34 +40,26 @@ def _figures(name: str) -> dict[str, Any]:
 
 
 def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[object]]) -> Table:
-    """Returns the table of a character's links and joints.
+    """Returns the table of a compiled character's links and joints.
 
-    Args:
-      figure: the character.
-      physics: physics with the compiled character.
-      last: title of the last column, and its entry for each joint.
+    `last` is the title of the last column, and its entry for each joint.
     """
-    masses = floats(physics.bind(figure.bodies).mass)
-    own = figure.spec.root_weight if last[0] == REWARD_WEIGHT else ''
+    masses, spec = floats(physics.bind(figure.bodies).mass), figure.spec
+    own = spec.root_weight if last[0] == REWARD_WEIGHT else ''
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', own)]
-    for (name, joint), mass, (low, high), limit, slides, ball, more in zip(
-        figure.spec.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
-        figure.prismatic, figure.spherical, last[1], strict=True,
-    ):  # fmt: skip
+    ranges, limits = figure.joint_ranges, figure.torque_limits
+    kinds = zip(figure.prismatic, figure.spherical, last[1], strict=True)
+    rows = zip(spec.joints.items(), masses[1:], ranges, limits, kinds, strict=True)
+    for (name, joint), mass, (low, high), limit, (slides, ball, more) in rows:
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
         if ball:
             reach = f'ball, up to {high:.3g}'
         units = ('m', 'N', 'N/m', 'N s/m') if slides else ('', '', '', '')
         values = (reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}')
-        cells.append((
-            name, mass, *(f'{text} {unit}'.rstrip() for text, unit in zip(values, units, strict=True)),
-            more,
-        ))  # fmt: skip
-    header = (
-        'link and joint', 'kg', 'range (rad)', 'limit (N m)', 'kp (N m/rad)', 'kd (N m s/rad)',
-        last[0],
-    )  # fmt: skip
-    return Table(header, cells)
+        texts = (f'{value} {unit}'.rstrip() for value, unit in zip(values, units, strict=True))
+        cells.append((name, mass, *texts, more))
+    gains = 'kp (N m/rad)', 'kd (N m s/rad)'
+    return Table(('link and joint', 'kg', 'range (rad)', 'limit (N m)', *gains, last[0]), cells)
 
 
 def observation(environment: Environment) -> Section:

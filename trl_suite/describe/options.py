@@ -18,6 +18,7 @@ from trl_suite.util.tables import Section, Table, section
 
 def options(spec: EnvSpec) -> Section:
     """Returns the table of an environment's options."""
+    common = dataclasses.fields(CommonOptions)
     cells: list[tuple[object, ...]] = [
         *(
             (name, _shown(default), data['unit'], data['meaning'])
@@ -25,21 +26,16 @@ def options(spec: EnvSpec) -> Section:
             if data['actuation'] in (None, spec.actuation)
         ),
         (', '.join(additions.OPTIONS), '-', '', 'custom functions; see docs/make_your_own.md'),
-        *((each.name, '-', '', each.metadata['meaning']) for each in dataclasses.fields(CommonOptions)),
+        *((each.name, '-', '', each.metadata['meaning']) for each in common),
         ('random', '-', '', 'seed; by default drawn from the operating system'),
         ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
         ('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'),
-    ]  # fmt: skip
+    ]
     return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
 
 
 def disturbances(actuation: str, blocks: Iterable[Block]) -> Iterator[Section]:
-    """Yields the options of actuators, worlds, pushes and sensors.
-
-    Args:
-      actuation: the actuation model.
-      blocks: the observation blocks of the task.
-    """
+    """Yields the options of actuators, worlds, pushes and sensors; blocks are those of the task."""
     omitted = NOT_FOR_MUSCLES if actuation == 'muscle' else ()
     yield section('Options of actuators', table_of(Actuators, omitted))
     yield section(

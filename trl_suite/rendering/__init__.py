@@ -1,4 +1,8 @@
-"""Rendering without a display: frames, videos, film strips, plots of terrain, height maps."""
+"""Rendering without a display: frames, videos, film strips, plots of terrain, height maps.
+
+Whatever writes a file raises an ImportError if the extra that it needs is not installed, 'video' or
+for replays 'viewer', and an OSError if the file cannot be written.
+"""
 
 from trl_suite.rendering.drawing import (
     Policy,
@@ -7,7 +11,9 @@ from trl_suite.rendering.drawing import (
     check_options,
     frame,
     frames,
+    has_display,
     no_gl,
+    played,
     replay,
 )
 from trl_suite.rendering.pictures import (
@@ -35,8 +41,10 @@ __all__ = [
     'film_strip',
     'frame',
     'frames',
+    'has_display',
     'height_map',
     'no_gl',
+    'played',
     'plot_terrain',
     'replay',
     'spread',

@@ -49,15 +49,7 @@ def free_place(
     """Returns the place closest to a camera, on the line to a body, from which the body is visible.
 
     Geoms of other bodies hide it if the camera is inside them, or less than `HIDING` behind them.
-
-    Args:
-      model: the model.
-      data: its current state.
-      body: the body that the camera follows.
-      place: place of the camera, (3,) m.
-
-    Returns:
-      `place` if no geom hides the body, (3,) m.
+    Without any, the place of the camera, (3,) m, is returned.
     """
     centre = data.subtree_com[model.body_rootid[body]].copy()
     hits = _hits(model, data, body, centre, place)

@@ -20,7 +20,7 @@ from dm_control import _render
 from dm_control._render import base, executor
 from dm_control._render.base import _CURRENT_CONTEXT_FOR_THREAD, _CURRENT_THREAD_FOR_CONTEXT
 
-from trl_suite.rendering.drawing import no_gl
+from trl_suite.rendering.drawing import has_display, no_gl
 
 # What makes no context current, by class of dm_control; the argument is its module.
 _RELEASES: dict[str, Callable[[Any], object]] = {
@@ -64,7 +64,7 @@ def _make(kind: Any, max_width: int, max_height: int) -> Any:
     global _owner
     _check_process()
     try:
-        if _render.BACKEND == 'glfw' and not _display():
+        if _render.BACKEND == 'glfw' and not has_display():
             name = os.environ.get('MUJOCO_GL')
             if name not in ('egl', 'osmesa'):
                 raise RuntimeError('GLFW finds no display')
@@ -76,12 +76,6 @@ def _make(kind: Any, max_width: int, max_height: int) -> Any:
         raise RuntimeError(no_gl(error)) from error
     _owner = os.getpid()
     return made
-
-
-def _display() -> bool:
-    return sys.platform != 'linux' or bool(
-        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
-    )
 
 
 @functools.cache

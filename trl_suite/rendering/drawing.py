@@ -19,7 +19,9 @@ to files, and makes pictures without OpenGL.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -99,10 +101,7 @@ def check_options(
 ) -> int:
     """Checks the options of `frame`; returns the number of the camera.
 
-    Args:
-      model: the `mujoco.MjModel`; it may lack visual assets.
-      task: its task.
-      height, width, camera, ghost: as for `frame`.
+    The model, a `mujoco.MjModel`, may lack visual assets.
     """
     from trl_suite.rendering import overlays
 
@@ -123,32 +122,58 @@ def frames(
 ) -> Iterator[np.ndarray]:
     """Runs a policy after a reset, through successive episodes, and renders every state.
 
-    If steps last longer than 1/30 s (gaits), there is a frame every 1/30 s instead.
-
-    Args:
-      environment: reset and stepped by this function.
-      policy: time step -> action; not called at the end of an episode.
-      steps: control steps.
-      **options: of `frame`.
+    If steps last longer than 1/30 s (gaits), there is a frame every 1/30 s instead. Options are those
+    of `frame`, and other arguments those of `played`.
 
     Yields:
       One frame per state: `steps` frames, and one more for every reset.
     """
     within: list[np.ndarray] = []
 
-    def look() -> None:
+    def look(first: bool) -> None:
         within.append(frame(environment, **options))
 
-    time_step = environment.reset()
-    yield frame(environment, **options)
-    for _ in range(steps):
+    for _ in played(environment, policy, steps, look):
+        yield from within
+        within.clear()
+
+
+def played(
+    environment: composer.Environment,
+    policy: Policy,
+    steps: int,
+    look: Callable[[bool], object] | None = None,
+) -> Iterator[tuple[int, Any, np.ndarray]]:
+    """Runs a policy after a reset, through successive episodes.
+
+    Args:
+      environment: reset and stepped by this function.
+      policy: time step -> action; not called at the end of an episode.
+      steps: control steps.
+      look: called for each frame, with whether it is the first one of an episode.
+
+    Yields:
+      The number of steps so far, every time step, and the action that follows it: zeros at ends of
+      episodes.
+    """
+    none = np.zeros(environment.action_spec().shape)
+    time_step, done = environment.reset(), 0
+    while True:
+        if look is not None and time_step.first():
+            look(True)
+        action = none if done == steps or time_step.last() else policy(time_step)
+        yield done, time_step, action
+        if done == steps:
+            return
         if time_step.last():
             time_step = environment.reset()
-            yield frame(environment, **options)
-        within.clear()
-        with calling_each_frame(environment, look):
-            time_step = environment.step(policy(time_step))
-        yield from within
+        else:
+            with contextlib.ExitStack() as stack:
+                if look is not None:
+                    later = functools.partial(look, False)
+                    stack.enter_context(calling_each_frame(environment, later))
+                time_step = environment.step(action)
+            done += 1
 
 
 def replay(
@@ -164,10 +189,8 @@ def replay(
     hosts. Recording needs no OpenGL.
 
     Args:
-      environment: reset and stepped by this function.
-      policy: time step -> action; not called at the end of an episode.
+      environment, policy, steps: as for `played`.
       path: file to write, .html; None for none.
-      steps: control steps.
       ghost: also show the reference clip.
 
     Returns:
@@ -175,21 +198,15 @@ def replay(
     """
     from trl_suite.rendering.replays import Replay
 
-    time_step = environment.reset()
     with Replay(environment, path, ghost=ghost) as recording:
-        recording.add(jump=True)
-        for _ in range(steps):
-            if time_step.last():
-                time_step = environment.reset()
-                recording.add(jump=True)
-            with calling_each_frame(environment, recording.add):
-                time_step = environment.step(policy(time_step))
+        for _ in played(environment, policy, steps, recording.add):
+            pass
     return recording
 
 
 @contextlib.contextmanager
 def calling_each_frame(
-    environment: composer.Environment, look: Callable[[], None]
+    environment: composer.Environment, look: Callable[[], object]
 ) -> Iterator[None]:
     """Calls `look` every 1/30 s of a step that lasts longer than that, after another step once."""
     task: Any = environment.task
@@ -228,6 +245,12 @@ def check_gl(physics: Any) -> None:
     contexts.install()
     with interrupts.postponed():  # half a context would print a traceback when it is freed
         _ = physics.contexts
+
+
+def has_display() -> bool:
+    """Whether a window can probably be opened."""
+    names = 'DISPLAY', 'WAYLAND_DISPLAY'
+    return sys.platform != 'linux' or any(map(os.environ.get, names))
 
 
 def no_gl(error: Exception) -> str:

@@ -42,7 +42,7 @@ def ghost(task: Any) -> Overlay:
         before = scene.ngeom
         options = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC
         mujoco.mjv_addGeoms(model, data, *options, scene)
-        root = model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == addresses[0])[0]]
+        root = model.jnt_bodyid[root_joint(model, task)]
         for geom in scene.geoms[before : scene.ngeom]:
             # Moving boxes have no ghosts.
             own = model.body_rootid[model.geom_bodyid[geom.objid]] == model.body_rootid[root]
@@ -51,6 +51,11 @@ def ghost(task: Any) -> Overlay:
             geom.matid = -1
 
     return add
+
+
+def root_joint(model: Any, task: Any) -> int:
+    """Returns the id of the first root joint of a task's character."""
+    return int(np.flatnonzero(model.jnt_qposadr == task.figure.pose_qpos[0])[0])
 
 
 def has_ghost(task: Any) -> bool:

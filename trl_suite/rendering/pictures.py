@@ -48,8 +48,6 @@ def film_strip(
 
     Raises:
       ValueError: no pictures, pictures of different sizes, columns below 1, or another suffix.
-      ImportError: a path is given and the extra 'video' is not installed.
-      OSError: the file cannot be written.
     """
     if columns < 1:
         raise ValueError(f'columns is {columns}; expected at least 1')
@@ -96,8 +94,6 @@ def plot_terrain(
 
     Raises:
       ValueError: invalid arguments; see also `trl_suite.terrain.load`.
-      ImportError: the extra 'video' is not installed.
-      OSError: the file cannot be written.
     """
     terrain = terrains.load(terrain)
     target = check_path(path, IMAGE_SUFFIXES)
@@ -171,11 +167,11 @@ def _plot_maps(
     if low == high:
         low, high = low - 0.5, high + 0.5
     half = 0.5 * length
+    extent, scale = (-half, half, -half, half), {'vmin': low, 'vmax': high, 'cmap': 'viridis'}
     for panel, heights, (x, y, heading) in zip(panels, maps, starts, strict=True):
         image = panel.imshow(
-            heights, origin='lower', extent=(-half, half, -half, half), vmin=low, vmax=high,
-            cmap='viridis', interpolation='nearest',
-        )  # fmt: skip
+            heights, origin='lower', extent=extent, interpolation='nearest', **scale
+        )
         panel.annotate(
             '',
             xytext=(x, y),
@@ -209,8 +205,6 @@ def height_map(
 
     Raises:
       ValueError: the task does not observe such a map, reach is not positive, or another suffix.
-      ImportError: a path is given and the extra 'video' is not installed.
-      OSError: the file cannot be written.
     """
     task: Any = environment.task
     part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))

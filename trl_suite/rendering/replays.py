@@ -47,8 +47,6 @@ class Replay:
         Raises:
           ValueError: another suffix, an fps that is not positive, or a ghost although the task has
             no reference clip.
-          ImportError: the extra 'viewer' is not installed.
-          OSError: the file cannot be written.
         """
         self._path = None if path is None else check_path(path, REPLAY_SUFFIXES)
         checked('fps', fps, float, above=0)

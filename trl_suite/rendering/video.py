@@ -34,8 +34,6 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
 
     Raises:
       ValueError: another suffix, no pictures, pictures of different sizes, or an odd size for h264.
-      ImportError: the extra 'video' is not installed.
-      OSError: the file cannot be written.
     """
     with Video(path, fps) as writer:
         # disable=None: no bar where stderr is not a terminal; a notebook always has one.

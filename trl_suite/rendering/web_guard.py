@@ -67,7 +67,7 @@ class Guard:
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
         """Guards the viser server that is started inside."""
-        module = websockets.asyncio.server
+        module: Any = websockets.asyncio.server
         # Browsers may leave at any time.
         warnings.filterwarnings('ignore', 'Queued a .* on a closed connection')
         with _STARTING:
@@ -87,11 +87,11 @@ class Guard:
                 }
                 return serve(self._checking(handler), *arguments, **options)
 
-            module.serve = guarded  # type: ignore[assignment, misc]
+            module.serve = guarded
             try:
                 yield
             finally:
-                module.serve = serve  # type: ignore[misc]
+                module.serve = serve
 
     def _admit(self, answer: Any, connection: Any, request: Any) -> Any:
         """Answers a request, or returns None if it may become a websocket."""
@@ -203,12 +203,7 @@ def _decoded(data: Any) -> Any:
 
 
 def check_value(control: Any, value: Any) -> None:
-    """Checks a new value of a control.
-
-    Args:
-      control: handle of a dropdown, a group of buttons, a slider, a number, a checkbox or a button.
-      value: the value, as a browser sent it.
-    """
+    """Checks a new value, as a browser sent it, of a control, whatever its kind."""
     name = control.label
     if hasattr(control, 'options'):
         if value not in control.options:

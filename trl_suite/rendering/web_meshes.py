@@ -27,10 +27,8 @@ NEAR = 8.0  # m; distance from the centre of a height field within which all ver
 def shape_mesh(name: str, model: Any) -> trimesh.Trimesh:
     """Returns the mesh of a shape.
 
-    Args:
-      name: 'box', 'sphere', 'cylinder', 'cone' or 'tube', of size 1; or 'mesh_3' for mesh 3 of the
-        model, in its own size.
-      model: the model.
+    Names are 'box', 'sphere', 'cylinder', 'cone' and 'tube', of size 1; and, for example, 'mesh_3'
+    for mesh 3 of the model, in its own size.
     """
     kind, _, number = name.partition('_')
     if kind != 'mesh':
@@ -44,15 +42,14 @@ def shape_mesh(name: str, model: Any) -> trimesh.Trimesh:
 @functools.cache
 def _shape(name: str) -> trimesh.Trimesh:
     """Returns a mesh of size 1."""
-    if name == 'box':
-        return trimesh.creation.box(extents=(2, 2, 2))
-    if name == 'sphere':
-        return trimesh.creation.icosphere(subdivisions=2)
-    if name == 'cylinder':
-        return trimesh.creation.cylinder(1.0, 2.0, SECTIONS)
-    if name == 'cone':
-        return trimesh.creation.cone(1.0, 1.0, sections=SECTIONS)
-    return trimesh.creation.annulus(0.999, 1.0, 2.0, sections=SECTIONS)  # a tube
+    make = trimesh.creation
+    return {
+        'box': lambda: make.box(extents=(2, 2, 2)),
+        'sphere': lambda: make.icosphere(subdivisions=2),
+        'cylinder': lambda: make.cylinder(1.0, 2.0, SECTIONS),
+        'cone': lambda: make.cone(1.0, 1.0, sections=SECTIONS),
+        'tube': lambda: make.annulus(0.999, 1.0, 2.0, sections=SECTIONS),
+    }[name]()
 
 
 def ground_meshes(
@@ -60,13 +57,8 @@ def ground_meshes(
 ) -> dict[tuple[int, str], trimesh.Trimesh]:
     """Returns the geoms of the ground as one mesh per material and kind.
 
-    Kinds are 'boxes' and 'field', in world coordinates, and 'plane', around x = y = 0.
-
-    Args:
-      model: the model.
-      data: its state.
-      is_ground: which geoms are the ground, (geoms,) bool.
-      lowest: height below which geoms are left out, m.
+    Kinds are 'boxes' and 'field', in world coordinates, and 'plane', around x = y = 0. Geoms below
+    the height `lowest`, m, are left out.
     """
     parts: dict[tuple[int, str], list[trimesh.Trimesh]] = {}
     for geom in np.flatnonzero(is_ground):
@@ -157,9 +149,7 @@ def height_field_mesh(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
 def _first_fine(vertices: int, half: float) -> int:
     """Returns from which vertex of a side, as far as to its mirror image, cells are fine.
 
-    Args:
-      vertices: number of vertices along the side.
-      half: half length of the side, m.
+    `half` is half the length of the side, m.
     """
     cells = vertices - 1
     if cells % 2:  # cannot be paired
@@ -185,10 +175,8 @@ def squares(mesh: trimesh.Trimesh, middle: np.ndarray, reach: float) -> tuple[tr
 
     Clients load a texture in the background; without one, they draw changed ground at once.
 
-    Args:
-      mesh: the ground.
-      middle: point, a multiple of `TILE`, around which the ground is cut.
-      reach: distance along x and y within which it is, a multiple of `TILE`.
+    The ground is cut around the point `middle`, within the distance `reach` along x and y, m, both
+    of them multiples of `TILE`.
     """
     upward = mesh.face_normals[:, 2]
     # Sides, if they are seen from above.
@@ -224,13 +212,10 @@ def _strips(triangles: np.ndarray, axis: int) -> np.ndarray:
 def _clip(
     triangles: np.ndarray, axis: int, line: np.ndarray, sign: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the parts of triangles beyond a line, and to which triangle each belongs.
+    """Returns the parts of triangles (n, 3, 3) beyond a line, and to which triangle each belongs.
 
-    Args:
-      triangles: (n, 3, 3) m.
-      axis: a coordinate.
-      line: its value on the line of each triangle, (n,) m.
-      sign: 1 for parts above, -1 for parts below the line.
+    On the line of each triangle, the coordinate `axis` is `line`, (n,) m. The sign is 1 for parts
+    above the line, -1 for those below.
     """
     distance = sign * (triangles[:, :, axis] - line[:, None])
     beyond = distance > TOLERANCE

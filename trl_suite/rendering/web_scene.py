@@ -16,7 +16,7 @@ import numpy as np
 
 from trl_suite.arenas import PlanarArena
 from trl_suite.arenas.scene import PARKED
-from trl_suite.rendering.overlays import Overlay
+from trl_suite.rendering.overlays import Overlay, root_joint
 from trl_suite.rendering.web_meshes import (
     SHADES,
     TILE,
@@ -53,12 +53,7 @@ class WebScene:
     """
 
     def __init__(self, server: Any, environment: Any) -> None:
-        """Clears the scene of a server.
-
-        Args:
-          server: a `viser.ViserServer`.
-          environment: any composer environment; its model must not be recompiled.
-        """
+        """Clears the scene of a `viser.ViserServer`; the model must not be recompiled."""
         self.option, self.follow = mujoco.MjvOption(), True
         self._server, self._physics = server, environment.physics
         model = self._model = environment.physics.model.ptr
@@ -144,10 +139,8 @@ class WebScene:
                 _assign(self._handles[name], visible=True, **values)
                 continue
             mesh = shape_mesh(name.removesuffix('_clear'), self._model)
-            self._handles[name] = self._server.scene.add_batched_meshes_simple(
-                f'/{name}', mesh.vertices, mesh.faces, lod='off',
-                flat_shading=not name.startswith(('sphere', 'tube')), **values,
-            )  # fmt: skip
+            values['flat_shading'] = not name.startswith(('sphere', 'tube'))
+            self._handles[name] = self._add_mesh(f'/{name}', mesh, **values)
         for name, handle in self._handles.items():
             if name not in batches and name != 'samples':
                 handle.visible = False
@@ -191,34 +184,37 @@ class WebScene:
         }
         for key, part in parts.items():
             if key in self._ground_handles:
-                _assign(
-                    self._ground_handles[key],
-                    vertices=part.vertices,
-                    faces=part.faces,
-                    visible=True,
-                )
+                shape = {'vertices': part.vertices, 'faces': part.faces}
+                _assign(self._ground_handles[key], visible=True, **shape)
                 continue
             material, kind, number = key
             colour = SHADES[number] * self._colours[material][:3]
-            self._ground_handles[key] = self._server.scene.add_batched_meshes_simple(
-                f'/ground_{material}_{kind}_{number}', part.vertices, part.faces,
-                batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), batched_positions=np.zeros((1, 3)),
+            self._ground_handles[key] = self._add_mesh(
+                f'/ground_{material}_{kind}_{number}',
+                part,
+                batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
+                batched_positions=np.zeros((1, 3)),
                 batched_colors=to_bytes(colour**GAMMA)[None],
-                flat_shading=kind != 'field', lod='off', cast_shadow=False,
-            )  # fmt: skip
+                flat_shading=kind != 'field',
+                cast_shadow=False,
+            )
         for key, handle in self._ground_handles.items():
             if key not in parts:
                 handle.visible = False
+
+    def _add_mesh(self, name: str, mesh: Any, **values: Any) -> Any:
+        add = self._server.scene.add_batched_meshes_simple
+        return add(name, mesh.vertices, mesh.faces, lod='off', **values)
 
     def _draw_samples(self, points: np.ndarray) -> None:
         points = points.astype(np.float32)
         if 'samples' in self._handles:
             _assign(self._handles['samples'], visible=True, points=points)
         else:
+            values = {'point_size': SAMPLE_SIZE, 'point_shape': 'circle', 'precision': 'float32'}
             self._handles['samples'] = self._server.scene.add_point_cloud(
-                '/samples', points, SAMPLE_COLOUR, point_size=SAMPLE_SIZE, point_shape='circle',
-                precision='float32',
-            )  # fmt: skip
+                '/samples', points, SAMPLE_COLOUR, **values
+            )
 
 
 def _assign(handle: Any, **values: Any) -> None:
@@ -228,11 +224,10 @@ def _assign(handle: Any, **values: Any) -> None:
 
 def root_body(environment: Any) -> int:
     """Returns the id of the character's root body; without a character, of the first moving body."""
-    model, figure = environment.physics.model, getattr(environment.task, 'figure', None)
-    if figure is None:
+    model, task = environment.physics.model, environment.task
+    if getattr(task, 'figure', None) is None:
         return int(np.flatnonzero(model.body_weldid)[0])
-    joint = np.flatnonzero(model.jnt_qposadr == figure.pose_qpos[0])[0]
-    return int(model.jnt_bodyid[joint])
+    return int(model.jnt_bodyid[root_joint(model, task)])
 
 
 def _instances(

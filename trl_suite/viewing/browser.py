@@ -13,6 +13,7 @@ token, without which it answers nobody: neither other users of the machine nor o
 
 from __future__ import annotations
 
+import functools
 import pathlib
 import queue
 import secrets
@@ -45,6 +46,16 @@ DECORATION = {  # visual elements drawn by MuJoCo
     'joint axes': mujoco.mjtVisFlag.mjVIS_JOINT,
     'centres of mass': mujoco.mjtVisFlag.mjVIS_COM,
 }
+
+
+def _request(method: Callable[..., None]) -> Callable[..., None]:
+    """Makes a method run in the thread that runs the simulation, between two frames."""
+
+    @functools.wraps(method)
+    def ask(self: Browser, *arguments: Any, **options: Any) -> None:
+        self._requests.put(functools.partial(method, self, *arguments, **options))
+
+    return ask
 
 
 class Browser:
@@ -105,9 +116,7 @@ class Browser:
         elif policy != 'best':
             named_policies.check(policy)
         token = secrets.token_hex(16)
-        self._server = web_server.start_server(
-            host, port, token, lambda sentence: self._ask(lambda: self._panel.tell(sentence))
-        )
+        self._server = web_server.start_server(host, port, token, self._tell)
         place = f'{self._server.get_port()}/{token}'
         self.url = f'http://{HOST if host == EVERY else host}:{place}'
         self.other_url = f'http://{socket.gethostname()}:{place}' if host == EVERY else ''
@@ -167,113 +176,90 @@ class Browser:
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" width="100%" height="600" style="border: none"></iframe>'
 
-    # Requests; the thread that runs the simulation handles them between two frames.
-
+    @_request
     def play(self, playing: bool) -> None:
         """Runs or pauses the simulation."""
-        self._ask(lambda: setattr(self, 'playing', playing))
+        self.playing = playing
 
+    @_request
     def step(self) -> None:
         """Pauses the simulation, and advances it by one frame."""
+        self.playing = False
+        self.session.advance()
+        self._redraw()
 
-        def step() -> None:
-            self.playing = False
-            self.session.advance()
-            self._redraw()
-
-        self._ask(step)
-
+    @_request
     def reset(self, seed: int | None = None) -> None:
         """Starts the next episode, or the first episode of a seed."""
+        self.seed = self.seed if seed is None else seed
+        self.session.reset(seed)
+        self._redraw()
 
-        def reset() -> None:
-            self.seed = self.seed if seed is None else seed
-            self.session.reset(seed)
-            self._redraw()
-
-        self._ask(reset)
-
+    @_request
     def push(self, direction: str, speed: float) -> None:
         """Pushes the character; see `Session.push`."""
-        self._ask(lambda: self.session.push(direction, speed))
+        self.session.push(direction, speed)
 
+    @_request
     def show(self, name: str, shown: bool) -> None:
         """Shows or hides an overlay, one of `shown`."""
+        self.shown[name] = shown
+        self._draw()
 
-        def show() -> None:
-            self.shown[name] = shown
-            self._draw()
-
-        self._ask(show)
-
+    @_request
     def follow(self, followed: bool) -> None:
         """Centres the view on the character, or leaves it to the users."""
+        self._scene.follow = followed
+        self._draw()
+        for client in self._server.get_clients().values():
+            self._scene.look_at_character(client)
 
-        def follow() -> None:
-            self._scene.follow = followed
-            self._draw()
-            for client in self._server.get_clients().values():
-                self._scene.look_at_character(client)
-
-        self._ask(follow)
-
+    @_request
     def choose_environment(self, spec: str | EnvSpec) -> None:
         """Shows another environment, with its best policy."""
+        self._loading(str(spec))
+        self._show(self._load(spec, 'best'))
 
-        def choose() -> None:
-            self._loading(str(spec))
-            self._show(self._load(spec, 'best'))
-
-        self._ask(choose)
-
+    @_request
     def choose_terrain(self, terrain: str | Mapping[str, Any]) -> None:
         """Puts the character on another terrain, an argument of `terrain.load`."""
+        spec, _, _, policy = self._loaded
+        self._show(self._load(spec.with_terrain(terrain), policy))
 
-        def choose() -> None:
-            spec, _, _, policy = self._loaded
-            self._show(self._load(spec.with_terrain(terrain), policy))
-
-        self._ask(choose)
-
+    @_request
     def choose_policy(self, name: str) -> None:
         """Switches to another policy, and starts at the first episode of the seed.
 
         An .npz file is read once; `upload_policy` replaces what it held.
         """
+        spec, environment, choices, _ = self._loaded
+        if name not in choices:
+            choices[name] = self._policy(name, environment, spec)
+        self._show(Loaded(spec, environment, choices, name))
 
-        def choose() -> None:
-            spec, environment, choices, _ = self._loaded
-            if name not in choices:
-                choices[name] = self._policy(name, environment, spec)
-            self._show(Loaded(spec, environment, choices, name))
-
-        self._ask(choose)
-
+    @_request
     def upload_policy(self, name: str, content: bytes) -> None:
         """Switches to a policy from the content of an .npz file, in place of one of that name."""
+        if not name.endswith('.npz'):
+            raise ValueError(f'{name}: expected a policy, .npz')
+        with tempfile.TemporaryDirectory(prefix='trl_suite_') as folder:
+            path = pathlib.Path(folder, 'policy.npz')  # the name may be any text
+            path.write_bytes(content)
+            try:
+                policy = policies.load(path)
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(path), name)) from None
+        spec, environment, choices, _ = self._loaded
+        policy.check(environment)
+        self._files[name] = policy
+        choices[name] = self._policy(name, environment, spec)
+        self._show(Loaded(spec, environment, choices, name))
 
-        def choose() -> None:
-            if not name.endswith('.npz'):
-                raise ValueError(f'{name}: expected a policy, .npz')
-            with tempfile.TemporaryDirectory(prefix='trl_suite_') as folder:
-                path = pathlib.Path(folder, 'policy.npz')  # the name may be any text
-                path.write_bytes(content)
-                try:
-                    policy = policies.load(path)
-                except ValueError as error:
-                    raise ValueError(str(error).replace(str(path), name)) from None
-            spec, environment, choices, _ = self._loaded
-            policy.check(environment)
-            self._files[name] = policy
-            choices[name] = self._policy(name, environment, spec)
-            self._show(Loaded(spec, environment, choices, name))
-
-        self._ask(choose)
+    @_request
+    def _tell(self, sentence: str) -> None:
+        self._panel.tell(sentence)
 
     # Implementation.
-
-    def _ask(self, work: Callable[[], None]) -> None:
-        self._requests.put(work)
 
     def _serve(self) -> None:
         while not self._requests.empty():

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,42 +12,33 @@ from trl_suite import terrain as terrains
 from trl_suite.rendering.web_server import load_viser
 from trl_suite.viewing.session import PUSHES, Loaded, Session
 
+if TYPE_CHECKING:
+    from trl_suite.viewing.browser import Browser
+
 SPEEDS = {'1/8': 0.125, '1/4': 0.25, '1/2': 0.5, '1': 1.0, '2': 2.0, '4': 4.0}
 PUSH = (0.1, 5.0, 1.0)  # m/s; minimum, maximum, initial value
 SLIDER_STEPS = 100
-COLOURS = (
-    '#1f77b4', '#ff7f0e', '#2ca02c', '#d62728', '#9467bd', '#8c564b', '#e377c2', '#7f7f7f',
-    '#bcbd22', '#17becf',
-)  # fmt: skip
+COLOURS = [
+    '#1f77b4',
+    '#ff7f0e',
+    '#2ca02c',
+    '#d62728',
+    '#9467bd',
+    '#8c564b',
+    '#e377c2',
+    '#7f7f7f',
+    '#bcbd22',
+    '#17becf',
+]
 PLOT_HEIGHT = 180  # pixels
 LEGEND = 8  # largest number of lines of a plot with a legend
 NOTICE = 8.0  # s; how long a message stays
 
 
-class Controlled(Protocol):
-    """The viewer that a panel controls; see `trl_suite.viewing.browser.Browser`."""
-
-    seed: int
-    playing: bool
-    speed: float
-    shown: dict[str, bool]
-
-    def play(self, playing: bool) -> None: ...
-    def step(self) -> None: ...
-    def reset(self, seed: int | None = None) -> None: ...
-    def push(self, direction: str, speed: float) -> None: ...
-    def show(self, name: str, shown: bool) -> None: ...
-    def follow(self, followed: bool) -> None: ...
-    def choose_environment(self, spec: str) -> None: ...
-    def choose_terrain(self, terrain: str | Mapping[str, Any]) -> None: ...
-    def choose_policy(self, name: str) -> None: ...
-    def upload_policy(self, name: str, content: bytes) -> None: ...
-
-
 class Panel:
     """The controls of a viewer, built once; `show` adapts them to an environment."""
 
-    def __init__(self, server: Any, viewer: Controlled) -> None:
+    def __init__(self, server: Any, viewer: Browser) -> None:
         self._server, self._viewer = server, viewer
         gui = server.gui
         gui.set_panel_label('trl_suite')
@@ -142,10 +132,7 @@ class Panel:
         apply = gui.add_button('Use this terrain')
         apply.on_click(
             lambda _: viewer.choose_terrain(
-                {
-                    'Type': terrain.type,
-                    'Params': [{key: slider.value for key, slider in sliders.items()}],
-                }
+                {'Type': terrain.type, 'Params': [{key: s.value for key, s in sliders.items()}]}
             )
         )
         self._fitted.append(apply)

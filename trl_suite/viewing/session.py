@@ -10,6 +10,7 @@ import dm_env
 import mujoco
 import numpy as np
 
+from trl_suite.rendering.overlays import root_joint
 from trl_suite.util import errors
 from trl_suite.viewing.playback import Playback
 
@@ -22,23 +23,21 @@ Policy = Callable[[dm_env.TimeStep], np.ndarray]
 FRAME = 1 / 30  # s of simulated time, at most, between two frames
 HISTORY = 300  # frames in the plots: 10 s
 PUSHES: Mapping[str, tuple[float, float, float]] = {  # directions, in world axes
-    'back': (-1, 0, 0), 'forward': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'up': (0, 0, 1),
-}  # fmt: skip
+    'back': (-1, 0, 0),
+    'forward': (1, 0, 0),
+    'left': (0, 1, 0),
+    'right': (0, -1, 0),
+    'up': (0, 0, 1),
+}
 _ENDS = ('fell', 'stuck', 'diverged')  # info keys that say why an episode ended
 
 
 class Moment(NamedTuple):
-    """The values that are plotted for one frame.
+    """The values that are plotted for one frame."""
 
-    Attributes:
-      time: simulated time since the session began, s.
-      rewards: the reward, then its terms, in the order of `Session.reward_names`.
-      torques: actuator torque on each joint axis, (k,) N m.
-    """
-
-    time: float
-    rewards: np.ndarray
-    torques: np.ndarray
+    time: float  # simulated time since the session began, s
+    rewards: np.ndarray  # the reward, then its terms, in the order of `Session.reward_names`
+    torques: np.ndarray  # (k,) N m; actuator torque on each joint axis
 
 
 class Loaded(NamedTuple):
@@ -66,12 +65,9 @@ class Session:
     """
 
     def __init__(self, environment: Environment, policy: Policy, seed: int | None = None) -> None:
-        """Starts the first episode.
+        """Starts the first episode; without a seed, the random state stays as it is.
 
-        Args:
-          environment: the environment, which nothing else may step.
-          policy: function of a time step that returns an action.
-          seed: seed of the environment's random state; None leaves the random state as it is.
+        Nothing else may step the environment.
         """
         self.environment, self.policy = environment, policy
         self._frames: Any = environment
@@ -93,11 +89,7 @@ class Session:
         self.reset(seed)
 
     def reset(self, seed: int | None = None) -> None:
-        """Starts an episode.
-
-        Args:
-          seed: as in the constructor. With a seed, the counts and the plots start again, too.
-        """
+        """Starts an episode; with a seed, the counts and the plots start again, too."""
         if seed is not None:
             self.environment.random_state.seed(seed)
             self.episode = 0
@@ -190,8 +182,8 @@ class Session:
 
 def _root_dofs(environment: Any) -> tuple[set[int], int]:
     """Returns the dof ids of the character's root joints, and the first of them."""
-    model, figure = environment.physics.model, environment.task.figure
-    joint = int(np.flatnonzero(model.jnt_qposadr == figure.pose_qpos[0])[0])
+    model = environment.physics.model
+    joint = root_joint(model, environment.task)
     first = int(model.jnt_dofadr[joint])
     free = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE)
     return set(range(first, first + (6 if free else 3))), first

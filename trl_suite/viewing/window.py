@@ -54,9 +54,11 @@ class Window(application.Application):
 def following(environment: Environment) -> Any:
     """Returns the settings of a camera that tracks the character."""
     task, model = environment.task, environment.physics.model
-    joint = int(np.flatnonzero(model.jnt_qposadr == task.figure.pose_qpos[0])[0])
     camera = wrapper.MjvCamera()
     camera.type_ = mujoco.mjtCamera.mjCAMERA_TRACKING
-    camera.fixedcamid, camera.trackbodyid = -1, int(model.jnt_bodyid[joint])
+    camera.fixedcamid, camera.trackbodyid = (
+        -1,
+        int(model.jnt_bodyid[overlays.root_joint(model, task)]),
+    )
     camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
     return camera
