@@ -1,0 +1,59 @@
+"""Writes a policy of Stable-Baselines3 in the format of the suite, which needs no PyTorch.
+
+    from stable_baselines3 import SAC
+    from stable_baselines_export import exported
+    from trl_suite import policies
+    from trl_suite.adapters.stable_baselines import SuiteVecEnv
+
+    envs = SuiteVecEnv('PD_Biped2D_Flat-v0', 8)
+    model = SAC('MlpPolicy', envs).learn(10_000)
+    policies.save(exported(model, envs.environment), 'sac.npz')
+
+For 'MlpPolicy' of PPO, A2C, SAC, TD3, DDPG and TQC, and observations that are not normalised.
+"""
+
+import numpy as np
+import torch
+
+from trl_suite import policies
+
+
+def exported(model, environment):
+    """Returns the deterministic policy.
+
+    The output of an actor is tanh(x): a change by tanh(x) of the only choice, the action 0. The
+    outputs are then a number for that choice, here 0, and x.
+
+    Args:
+      model: a model of Stable-Baselines3.
+      environment: the `VectorEnvironment` that it was trained in, or a similar one.
+    """
+    net = model.policy
+    squashed = hasattr(net, 'actor')
+    parts = (
+        net.actor if squashed else torch.nn.Sequential(net.mlp_extractor.policy_net, net.action_net)
+    )
+    layers = [
+        part for name, part in parts.named_modules()
+        if isinstance(part, torch.nn.Linear) and name != 'log_std'
+    ]  # fmt: skip
+    weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
+    biases = [layer.bias.detach().numpy().copy() for layer in layers]
+    k, a, options = len(weights[0]), len(biases[-1]), {}
+    if squashed:
+        weights[-1], biases[-1] = np.pad(weights[-1], ((0, 0), (1, 0))), np.pad(biases[-1], (1, 0))
+        options = {'choices': np.zeros((1, a)), 'largest_change': np.float32(1)}
+    return policies.Policy(
+        id=environment.spec.id,
+        blocks=tuple((name, part.stop - part.start) for name, part in environment.blocks.items()),
+        actions=environment.action_map.names,
+        quantity=environment.action_map.quantity,
+        mean=np.zeros(k),
+        std=np.ones(k),
+        clip=1e6,
+        weights=tuple(weights),
+        biases=tuple(biases),
+        activation='relu' if squashed else 'tanh',
+        log_std=np.zeros(a),
+        **options,
+    )
