@@ -67,6 +67,7 @@ setup(
     package_data={
         'trl_suite': ['py.typed'],
         'trl_suite.actuation': ['*.json'],
+        'trl_suite.benchmark': ['*.json'],
         'trl_suite.controllers': ['*.json'],
         'trl_suite.terrain': ['*.json'],
         'trl_suite.xml': ['*.xml'],
@@ -99,6 +100,7 @@ setup(
         'viewer': [VISER],
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
+        'benchmark': ['gymnasium>=1.1', 'stable-baselines3>=2.7', 'sb3-contrib>=2.7', TORCH],
         'minari': [MINARI],
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
         'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],

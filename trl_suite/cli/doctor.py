@@ -42,6 +42,7 @@ EXTRAS = {
     'tune': ('cma',),
     'clips': ('pybvh',),
     'minari': ('minari', 'h5py'),
+    'benchmark': ('stable_baselines3', 'sb3_contrib'),
 }
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',

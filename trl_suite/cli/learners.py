@@ -13,12 +13,12 @@ from trl_suite.cli.arguments import add_command, add_threads, positive
 from trl_suite.util import errors, program
 
 
-def add_learner(command: argparse.ArgumentParser, budget: str) -> None:
-    """Adds what a run of a learner needs."""
+def add_learner(command: argparse.ArgumentParser, *budgets: str) -> None:
+    """Adds what a run of a learner needs; the first budget is the default."""
     text = 'class of the learner: CLASS(course, seed), with the methods train(stage) and policy()'
     command.add_argument('--learner', required=True, metavar='MODULE:CLASS', help=text)
-    text = 'samples for each environment: a name of the page, or N'
-    command.add_argument('--budget', default=budget, help=text)
+    text = f'samples for each environment: {", ".join(budgets)}, or N'
+    command.add_argument('--budget', default=budgets[0], help=text)
     text = 'episodes per test and environment'
     command.add_argument('--episodes', type=positive, default=32, help=text)
     command.add_argument('--seed', type=int, default=0, help='seed of the run')

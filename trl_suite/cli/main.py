@@ -14,6 +14,8 @@
     trl-suite doctor
     trl-suite compile --all
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
+    trl-suite benchmark run --learner my_module:MyLearner --seed 0
+    trl-suite benchmark report MyLearner
     trl-suite sequences run plaid_biped --learner my_module:MyLearner --output result.json
     trl-suite sequences check result.json
 
@@ -37,7 +39,7 @@ from trl_suite.util import program
 
 # In the order of the help.
 COMMANDS = (
-    'list info rollout view evaluate dataset terrain clip try_file doctor compile bench sequences'
+    'list info rollout view evaluate dataset terrain clip try_file doctor compile bench benchmark sequences'
 )
 
 

@@ -18,7 +18,7 @@ def declare(commands: Any) -> None:
     text = 'train a learner on a sequence, and test it after each stage'
     command = add_command(actions, 'run', text, _run)
     command.add_argument('name', metavar='NAME', help='name of a sequence')
-    learners.add_learner(command, 'small')
+    learners.add_learner(command, 'small', 'full')
     command.add_argument('--stages', type=positive, metavar='N', help='stop after N stages')
     command.add_argument(
         '--output',

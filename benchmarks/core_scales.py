@@ -1,0 +1,47 @@
+"""Measures the scores that are 0 and 1 on the benchmark's scale: trl_suite/benchmark/scales.json.
+
+    python benchmarks/core_scales.py [ID ...] [--episodes N]
+
+Episodes have seeds that no run uses. A change of the file needs another version of the format of
+results, in trl_suite/benchmark/core.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from trl_suite import evaluation, policies, runs
+from trl_suite.benchmark import core
+from trl_suite.util import files, machine
+from trl_suite.util.program import begin_script
+
+SEED = 1_000_000  # of test seeds; runs have smaller ones
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('ids', nargs='*', default=list(core.CORE), metavar='ID')
+    parser.add_argument('--episodes', type=int, default=1024)
+    arguments = parser.parse_args()
+    for id in arguments.ids:
+        course, row = core.BENCHMARK.get(id), {'episodes': arguments.episodes}
+        for name in ('zero', 'random', 'shipped'):
+            baseline = evaluation.BASELINES.get(name)
+            result = evaluation.evaluate(
+                course.spec(id), baseline or policies.reference(id), arguments.episodes,
+                runs.test_seeds(arguments.episodes, SEED), factory=baseline is not None,
+            )  # fmt: skip
+            row[name] = round(result['normalized_return'], 4)
+            half = result['return_interval'] / result['step_limit']
+            print(f'{id} {name} {row[name]} +- {half:.4f}', flush=True)
+        # Read again: another process may have written other rows.
+        found = files.read_json(core.SCALES)['scores'] if core.SCALES.exists() else {}
+        found[id] = row
+        order = {id: found[id] for id in core.CORE if id in found}
+        made = {'format': core.BENCHMARK.format, **machine.made_with()}
+        files.write_json({**made, 'scores': order}, core.SCALES)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

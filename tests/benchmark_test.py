@@ -1,0 +1,407 @@
+"""The benchmark: core set, runs in parts, results, verification, and reports."""
+
+import contextlib
+import copy
+import dataclasses
+import json
+import pathlib
+import sys
+import tempfile
+from unittest import mock
+
+import cli_test
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import benchmark, evaluation, policies, runs, suite
+from trl_suite.benchmark import core, report
+from trl_suite.runs import results, running
+
+ID = 'PD_Biped2D_Gaps_Terrain-v0'
+
+
+class CoreTest(parameterized.TestCase):
+    def test_three_of_each_family(self):
+        families = [suite.find(id_).domain for id_ in benchmark.CORE]
+        self.assertEqual(
+            {name: families.count(name) for name in families},
+            {'plaid': 3, 'imitation': 3, 'terrainrl': 3, 'deeploco': 3},
+        )
+
+    @parameterized.parameters(*benchmark.CORE)
+    def test_scales(self, id_):
+        of = benchmark.scales()[id_]
+        low, high = benchmark.ends(id_)
+        self.assertEqual((low, high), (max(of['zero'], of['random']), of['shipped']))
+        self.assertLess(low + 0.1, high)
+        self.assertLessEqual(high, 1)
+        self.assertEqual(benchmark.normalised(id_, low), 0)
+        self.assertEqual(benchmark.normalised(id_, high), 1)
+
+    def test_what_was_measured(self):
+        made = json.loads(core.SCALES.read_text())
+        self.assertEqual(made['format'], benchmark.BENCHMARK.format)
+        self.assertEqual([*made['scores']], [*benchmark.CORE])
+        self.assertGreaterEqual(min(row['episodes'] for row in made['scores'].values()), 16)
+
+    def test_step_limits(self):
+        self.assertEqual(benchmark.get(ID).spec(ID).step_limit, 256)
+        gait = benchmark.get('FSM_Dog2D_Terrain_Mixed-v0')
+        stage = runs.Stage(gait, 0, 100, 0, 1)
+        self.assertEqual(stage.environments(1).step_limit, core.GAIT_LIMIT)
+
+    def test_unknown_environments(self):
+        with self.assertRaisesRegex(
+            ValueError, "unknown environment 'PD_Biped2D_Gap.*did you mean"
+        ):
+            benchmark.get('PD_Biped2D_Gap_Terrain-v0')
+
+
+class Counter:
+    """A learner that takes 7 samples of what it may, and whose scores are made up."""
+
+    def __init__(self, course=None, seed=0, stop_at=None):
+        self.budgets, self.stop_at = [], stop_at
+
+    def train(self, stage):
+        if len(self.budgets) == self.stop_at:
+            raise KeyboardInterrupt
+        self.budgets.append(stage.budget)
+        stage.spend(0, min(stage.left, 7))
+
+    def policy(self):
+        return len(self.budgets)
+
+    def save(self, folder):
+        (folder / 'budgets.json').write_text(json.dumps(self.budgets))
+
+    def load(self, folder):
+        self.budgets = json.loads((folder / 'budgets.json').read_text())
+
+
+class Other(Counter):
+    pass
+
+
+def made_up(cases, episodes, seeds, threads, executor):
+    assert min(seeds) >= runs.FIRST_TEST_SEED and len(seeds) == episodes
+    low, high = benchmark.ends(ID)
+    for spec, parts in cases:
+        assert spec.id in benchmark.CORE
+        yield {'normalized_return': low + (high - low) * parts / 20 * 0.8}
+
+
+class RunTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.path = self.folder / 'result.json'
+        self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
+        self.enterContext(mock.patch.object(running.time, 'perf_counter', lambda: 0.0))
+
+    def run_short(self, learner, path=None, **changes):
+        return benchmark.run(ID, learner, **{'budget': 200, 'path': path or self.path, **changes})
+
+    def test_parts(self):
+        """Of 10 samples each; what is left of one is for the next."""
+        learner = Counter()
+        result = self.run_short(learner)
+        self.assertEqual(learner.budgets, [10 + 3 * i for i in range(20)])
+        self.assertEqual(result['samples'], [[7]] * 20)
+        self.assertAlmostEqual(result['metrics']['score'], 0.8)
+        self.assertAlmostEqual(result['metrics']['mean_score'], 0.8 * 10.5 / 20)
+        self.assertEqual(benchmark.read(self.path), result)
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+
+    @parameterized.parameters(0, 1, 13)
+    def test_a_stopped_run_resumes(self, stop_at):
+        whole = self.run_short(Counter(), self.folder / 'whole.json')
+        with self.assertRaises(KeyboardInterrupt):
+            self.run_short(Counter(stop_at=stop_at))
+        self.assertEqual(self.run_short(Counter()), whole)
+
+    def test_what_is_comparable(self):
+        result = self.run_short(Counter(), seed=7, episodes=4)
+        notes = benchmark.departures(result)
+        self.assertEqual(notes, [
+            'budget is 200, not 1000000 or 10000000', 'episodes is 4, not 32',
+            'seed is 7, not 0 or 1 or 2 or 3 or 4',
+        ])  # fmt: skip
+        same = {**result, 'budget': 10**6, 'episodes': 32, 'seed': 4}
+        self.assertEqual(benchmark.departures(same), [])
+
+    @parameterized.parameters(
+        ('format', 'trl_suite benchmark 0', "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'"),
+        ('environment', 'PD_Dog2D_Flat_Terrain-v0', "unknown environment of the core set 'PD_Dog2D_Flat"),
+        ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps"),
+        ('samples', [[7]] * 19 + [[100]], r'samples\[19\] is \[100\], in total 100; .* at most 67'),
+        ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20'),
+        ('metrics', {'score': 0.9, 'mean_score': 0.42}, r'metrics.score is 0.9; expected 0.(8|79)'),
+        ('policy', 7, 'policy is 7; expected a string'),
+        ('seconds', [1.0] * 20, 'digest is .* changed after the run'),
+    )  # fmt: skip
+    def test_edited_results(self, name, value, message):
+        result = self.run_short(Counter())
+        result[name] = value
+        if name != 'seconds':
+            result['digest'] = results.digest(result)
+        with self.assertRaisesRegex(ValueError, message):
+            benchmark.check(result)
+
+    def test_a_policy_of_the_user_is_not_replaced(self):
+        (self.folder / 'result.npz').write_text('own')
+        with self.assertRaisesRegex(FileExistsError, 'result.npz: exists; remove it, or choose'):
+            self.run_short(Counter())
+
+
+class Shipped:
+    """A learner whose policy is the shipped one."""
+
+    def __init__(self, course, seed):
+        self.id = course.ids[0]
+
+    def train(self, stage):
+        pass
+
+    def policy(self):
+        return policies.reference(self.id)
+
+
+class VerifyTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.path = self.folder / 'result.json'
+        # With two parts instead of twenty.
+        courses = {ID: dataclasses.replace(benchmark.get(ID), parts=2)}
+        self.benchmark = dataclasses.replace(benchmark.BENCHMARK, courses=courses)
+        learner = Shipped(courses[ID], 0)
+        self.result = self.benchmark.run(ID, learner, 2, self.path, 2, 3, 1)
+
+    def write(self, **changes):
+        result = {**copy.deepcopy(self.result), **changes}
+        result['digest'] = results.digest(result)
+        self.path.write_text(json.dumps(result))
+
+    def test_entries(self):
+        self.assertEqual(self.benchmark.verify(self.path, 2), self.result)
+        scores = self.result['scores']
+        self.write(scores=[scores[0], [np.nextafter(scores[1][0], 0)]])
+        with self.assertRaisesRegex(ValueError, r'scores\[-1\] is .*; measured'):
+            self.benchmark.verify(self.path, 1)
+
+    def test_one_changed_weight(self):
+        stored = self.path.with_suffix('.npz')
+        policy = policies.load(stored)
+        weight = policy.weights[1].copy()
+        weight[3, 5] += 1e-3
+        weights = policy.weights[0], weight, *policy.weights[2:]
+        policies.save(dataclasses.replace(policy, weights=weights), stored)
+        with self.assertRaisesRegex(
+            ValueError, 'policy is .*one of the two was changed after the run'
+        ):
+            self.benchmark.verify(self.path, 1)
+        self.write(policy=running._sha256(stored))
+        with self.assertRaisesRegex(ValueError, r'scores\[-1\] is \[0.*\]; measured \[0'):
+            self.benchmark.verify(self.path, 1)
+        # Made on another class of processor, it is within the tolerance.
+        self.write(policy=running._sha256(stored), cpu='other')
+        self.benchmark.verify(self.path, 1)
+
+    def test_a_policy_of_another_environment(self):
+        stored = self.path.with_suffix('.npz')
+        policies.save(policies.reference('PD_Dog2D_Gaps_Terrain-v0'), stored)
+        self.write(policy=running._sha256(stored))
+        with self.assertRaisesRegex(ValueError, 'PD_Dog2D_Gaps_Terrain-v0'):
+            self.benchmark.verify(self.path, 1)
+
+    def test_no_policy(self):
+        self.path.with_suffix('.npz').unlink()
+        with self.assertRaisesRegex(FileNotFoundError, 'result.npz: there is no such file'):
+            self.benchmark.verify(self.path, 1)
+
+
+def result_of(learner, id_, seed, score, **changes):
+    """A result whose normalised scores rise linearly to `score`."""
+    low, high = benchmark.ends(id_)
+    curve = [[low + (high - low) * score * (part + 1) / 20] for part in range(20)]
+    return {'learner': learner, 'environment': id_, 'seed': seed, 'budget': 200, 'episodes': 32,
+            'scores': curve, **changes}  # fmt: skip
+
+
+class ReportTest(parameterized.TestCase):
+    IDS = [*benchmark.CORE][:2]
+
+    def results(self):
+        a = [[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 1.5]]
+        for id_, scores in zip(self.IDS, a, strict=True):
+            for seed, score in enumerate(scores):
+                yield result_of('m:A', id_, seed, score)
+                yield result_of('m:B', id_, seed, 0.35)
+        yield result_of('m:A', [*benchmark.CORE][3], 0, 0.9)  # not an environment of B
+
+    def test_statistics(self):
+        """Computed by hand: the interquartile mean leaves out two of eight scores at each end."""
+        found = report.report(self.results())
+        a, b = found['learners']['m:A'], found['learners']['m:B']
+        self.assertEqual(found['environments'], self.IDS)
+        self.assertEqual(found['samples'], [10 * (part + 1) for part in range(20)])
+        self.assertAlmostEqual(a['iqm'][0], (0.3 + 0.4 + 0.5 + 0.6) / 4)
+        self.assertAlmostEqual(a['median'][0], 0.45)
+        self.assertAlmostEqual(a['mean'][0], 4.3 / 8)
+        self.assertAlmostEqual(a['optimality_gap'][0], 1 - 3.8 / 8)
+        np.testing.assert_allclose(b['iqm'], 0.35)
+        self.assertLess(a['iqm'][1], a['iqm'][0])
+        self.assertLess(a['iqm'][0], a['iqm'][2])
+        np.testing.assert_allclose(np.array(a['curve'])[:, 0], 0.45 * np.arange(1, 21) / 20)
+        shares = dict(zip(report.LEVELS.round(2), np.array(a['profile'])[:, 0], strict=True))
+        self.assertEqual((shares[0.0], shares[0.45], shares[1.2]), (1, 0.5, 0.125))
+        self.assertAlmostEqual(found['improvement']['m:A, m:B'][0], (0.25 + 1) / 2)
+        self.assertAlmostEqual(found['improvement']['m:B, m:A'][0], (0.75 + 0) / 2)
+        self.assertEqual(found, json.loads(json.dumps(found)))
+        text = report.table(found)
+        self.assertIn('| m:A | 4 | 0.450 (', text)
+        self.assertIn('2 of 12 environments, 200 samples', text)
+
+    def test_intervals_cover_the_mean(self):
+        """Of 200 samples of 5 runs, about 5 % do not; the bootstrap of few runs is a bit narrow."""
+        random = np.random.default_rng(0)
+        with mock.patch.object(report, 'REPEATS', 300):
+            covered = []
+            for _ in range(200):
+                scores = random.normal(0.5, 0.1, (5, 12, 1))
+                _, low, high = report._estimates(scores)['mean']
+                covered.append(low <= 0.5 <= high)
+        self.assertBetween(np.mean(covered), 0.8, 0.99)
+
+    def test_results_that_cannot_be_compared(self):
+        first = result_of('m:A', self.IDS[0], 0, 0.5)
+        for others, message in (
+            ([first], 'two results of m:A in PD_Biped2D.* with seed 0'),
+            ([{**first, 'seed': 1, 'budget': 300}], r'the budget \[200, 300\]; expected one'),
+            ([{**first, 'seed': 1, 'episodes': 3}], r'the episodes \[3, 32\]; expected one'),
+            ([result_of('m:B', self.IDS[1], 0, 1)], 'no environment is common to the learners m:A, m:B'),
+            ([result_of('m:A', self.IDS[1], 1, 1)], 'm:A: no seed is common to PD_Biped2D'),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(ValueError, message):
+                report.report([first, *others])
+
+
+MODULE = """
+import numpy as np
+
+class Nothing:
+    def __init__(self, course, seed):
+        self.size = 11
+
+    def train(self, stage):
+        environments = stage.environments(2)
+        environments.reset()
+        environments.step(np.zeros((2, self.size)))
+
+    def policy(self):
+        return lambda observation: np.zeros((len(observation), self.size))
+
+class Greedy(Nothing):
+    def train(self, stage):
+        environments = stage.environments(2)
+        environments.reset()
+        while True:
+            environments.step(np.zeros((2, self.size)))
+"""
+
+
+class CommandTest(cli_test.CommandTest):
+    def test_run_check_and_report(self):
+        pathlib.Path('my_learner.py').write_text(MODULE)
+        self.addCleanup(setattr, sys, 'path', list(sys.path))
+        command = (
+            'benchmark', 'run', ID, '--budget', '60', '--episodes', '1', '--threads', '1', '--learner',
+        )  # fmt: skip
+        with mock.patch.object(evaluation, 'evaluate_all', self.made_up):
+            out = self.output(*command, 'my_learner:Nothing')
+            self.assertEqual(out, f'Nothing/{ID}_s0.json: score 0.500\n')
+            self.assert_refused(
+                r'stage 0 \(PD_Biped2D_Gaps.*2 more samples; expected at most 1, since 2 of 3',
+                *command, 'my_learner:Greedy',
+            )  # fmt: skip
+        path = f'Nothing/{ID}_s0.json'
+        out = self.output('benchmark', 'check', path)
+        self.assertRegex(
+            out, f'{path}: my_learner:Nothing, {ID}, budget 60.*not comparable: budget'
+        )
+        out = self.output('benchmark', 'report', 'Nothing', '--json', 'report.json')
+        self.assertIn('| my_learner:Nothing | 1 | 0.500 (0.500 to 0.500) |', out)
+        found = json.loads(pathlib.Path('report.json').read_text())
+        self.assertEqual(found['environments'], [ID])
+        self.assert_refused('there is no such file', 'benchmark', 'verify', 'Nothing')
+        text = pathlib.Path(path).read_text().replace('"seed": 0', '"seed": 1')
+        pathlib.Path('edited.json').write_text(text)
+        self.assert_refused('edited.json: digest is', 'benchmark', 'check', 'edited.json')
+        pathlib.Path('empty').mkdir()
+        self.assert_refused('empty: has no results', 'benchmark', 'report', 'empty')
+        self.assert_refused(
+            "unknown environment 'PD_Gap'",
+            'benchmark',
+            'run',
+            'PD_Gap',
+            *command[3:],
+            'my_learner:Nothing',
+        )
+
+    @staticmethod
+    def made_up(cases, *_, executor):
+        low, high = benchmark.ends(ID)
+        return [{'normalized_return': (low + high) / 2} for _ in cases]
+
+    def test_list(self):
+        out = self.output('benchmark', 'list')
+        for id_, course in benchmark.CORE.items():
+            self.assertRegex(out, rf'{id_} +0\.\d+ +0\.\d+ +\d+  {course.description}')
+
+
+with contextlib.suppress(ImportError):
+    sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+    import stable_baselines_learners
+    import td3_learner
+
+    class StableBaselinesTest(parameterized.TestCase):
+        @parameterized.parameters(
+            stable_baselines_learners.PPO, stable_baselines_learners.SAC, td3_learner.TD3
+        )
+        def test_exported_policies_are_those_of_the_library(self, kind):
+            learner = kind(benchmark.get(ID), 0)
+            policy = learner.policy()
+            observations = np.random.default_rng(0).normal(size=(5, policy.observation_size))
+            expected, _ = learner.model.predict(observations.astype(np.float32), deterministic=True)
+            np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+            self.assertGreater(np.abs(expected).max(), 1e-3)
+            path = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory())) / 'policy.npz'
+            policies.save(policy, path)
+            np.testing.assert_array_equal(policies.load(path)(observations), policy(observations))
+
+        @parameterized.parameters(stable_baselines_learners.SAC, td3_learner.TD3)
+        def test_a_stopped_run_resumes_exactly(self, kind):
+            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+            def measured(cases, *_, executor):
+                for _, policy in cases:
+                    score = float(np.abs(policy.weights[1]).mean())
+                    yield {'normalized_return': min(score, 1.0)}
+
+            def run(name, stages=None):
+                course = benchmark.get(ID)
+                path = folder / name
+                return benchmark.run(course, kind(course, 0), 160, path, 1, 0, 1, stages=stages)
+
+            with mock.patch.object(evaluation, 'evaluate_all', measured):
+                whole = run('whole.json')
+                run('parts.json', 17)
+                parts = run('parts.json')
+            for name in ('scores', 'samples', 'curves', 'policy'):
+                self.assertEqual(parts[name], whole[name], name)
+            self.assertNotEqual(whole['scores'][-1], whole['scores'][0])
+
+
+if __name__ == '__main__':
+    absltest.main()

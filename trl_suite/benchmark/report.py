@@ -1,0 +1,154 @@
+"""Compares learners by their results, as Agarwal et al. (2021) recommend.
+
+Agarwal, Schwarzer, Castro, Courville & Bellemare: Deep Reinforcement Learning at the Edge of the
+Statistical Precipice. NeurIPS 2021. The definitions are those of its library rliable; intervals are
+from bootstrap samples of the runs of each environment.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from trl_suite.benchmark.core import CORE, normalised
+
+REPEATS = 2000  # bootstrap samples
+LEVELS = np.linspace(0, 1.2, 25)  # of performance profiles
+
+# Of normalised scores (..., runs * environments).
+AGGREGATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    'iqm': lambda scores: stats.trim_mean(scores, 0.25, axis=-1),
+    'median': lambda scores: np.median(scores, -1),
+    'mean': lambda scores: np.mean(scores, -1),
+    'optimality_gap': lambda scores: 1 - np.minimum(scores, 1).mean(-1),
+}
+
+
+def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Returns statistics of learners, a dict that can be written as JSON.
+
+    Only environments count that all learners have results of, and of each learner those seeds that
+    it has for all these environments. Every estimate is [value, low, high], with the bounds of its
+    95 % confidence interval.
+
+    Args:
+      results: complete results of one budget.
+
+    Returns:
+      * 'budget', 'environments', and 'samples' of the points of curves, (20,).
+      * 'learners': by name 'seeds'; 'scores', by environment those after each part of each run, (runs,
+        20); the estimates `AGGREGATES` after the run; 'curve', the interquartile mean after each
+        part, (20, 3); 'profile', the share of runs with a score above each of `LEVELS`, (25, 3).
+      * 'improvement': for pairs of learners 'A, B' the probability that a run of A has a higher score
+        than one of B in the same environment.
+
+    Raises:
+      ValueError: results of several budgets or lengths of tests, a run that is there twice, or
+        learners without a common environment or seed.
+    """
+    found: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
+    for result in results:
+        runs = found.setdefault(result['learner'], {})
+        key = result['environment'], result['seed']
+        if key in runs:
+            raise ValueError(f'two results of {result["learner"]} in {key[0]} with seed {key[1]}')
+        runs[key] = result
+    everything = [result for runs in found.values() for result in runs.values()]
+    for name in ('budget', 'episodes'):
+        values = sorted({result[name] for result in everything})
+        if len(values) != 1:
+            raise ValueError(f'results have the {name} {values}; expected one {name} in all')
+    ids = [id for id in CORE if all(any(key[0] == id for key in runs) for runs in found.values())]
+    if not ids:
+        raise ValueError(f'no environment is common to the learners {", ".join(found)}')
+    curves, learners = {}, {}
+    for learner, runs in sorted(found.items()):
+        seeds = sorted(set.intersection(*({s for i, s in runs if i == id} for id in ids)))
+        if not seeds:
+            raise ValueError(f'{learner}: no seed is common to {", ".join(ids)}')
+        own = np.array([
+            [[normalised(id, score) for (score,) in runs[id, seed]['scores']] for id in ids]
+            for seed in seeds
+        ])  # fmt: skip
+        curves[learner] = own  # (runs, environments, parts)
+        learners[learner] = {
+            'seeds': seeds,
+            'scores': {id: own[:, i].tolist() for i, id in enumerate(ids)},
+            **_estimates(own),
+        }
+    budget = everything[0]['budget']
+    parts = len(everything[0]['scores'])
+    return {
+        'budget': budget,
+        'environments': ids,
+        'samples': [budget * (part + 1) // parts for part in range(parts)],
+        'learners': learners,
+        'improvement': {
+            f'{a}, {b}': _improvement(curves[a][..., -1], curves[b][..., -1])
+            for a, b in itertools.permutations(curves, 2)
+        },
+    }
+
+
+def _samples(scores: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Returns the scores, and bootstrap samples of the runs of each environment.
+
+    Args:
+      scores: (runs, environments, ...).
+      seed: seed of the samples.
+
+    Returns:
+      (1 + `REPEATS`, runs, environments, ...).
+    """
+    runs, ids = scores.shape[:2]
+    drawn = np.random.default_rng(seed).integers(runs, size=(REPEATS, runs, ids))
+    return np.concatenate([scores[None], scores[drawn, np.arange(ids)]])
+
+
+def _interval(values: np.ndarray) -> list[Any]:
+    """Returns the first value and a 95 % confidence interval from the others, (..., 3)."""
+    bounds = np.percentile(values[1:], (2.5, 97.5), axis=0)
+    return np.stack([values[0], *bounds], -1).tolist()
+
+
+def _estimates(scores: np.ndarray) -> dict[str, Any]:
+    samples = _samples(scores)
+    flat = samples.reshape(len(samples), -1, scores.shape[-1])
+    last = flat[..., -1]
+    profile = np.stack([(last > level).mean(-1) for level in LEVELS], -1)
+    return {
+        **{name: _interval(function(last)) for name, function in AGGREGATES.items()},
+        'curve': _interval(AGGREGATES['iqm'](flat.swapaxes(1, 2))),
+        'profile': _interval(profile),
+    }
+
+
+def _improvement(a: np.ndarray, b: np.ndarray) -> list[float]:
+    """Returns the mean over environments of P(a run of A > one of B); ties count half."""
+    first, second = _samples(a)[:, :, None], _samples(b, 1)[:, None]
+    return _interval(((first > second) + 0.5 * (first == second)).mean((1, 2, 3)))
+
+
+def table(found: dict[str, Any]) -> str:
+    """Returns the statistics of `report` as tables in Markdown."""
+    ids, learners = found['environments'], found['learners']
+    lines = [
+        f'{len(ids)} of {len(CORE)} environments, {found["budget"]:,} samples, 95 % confidence intervals', '',
+        f'| learner | seeds | {" | ".join(AGGREGATES)} |', '|--|--:|' + '--|' * len(AGGREGATES),
+    ]  # fmt: skip
+    for learner, of in sorted(learners.items(), key=lambda item: -item[1]['iqm'][0]):
+        cells = ['{:.3f} ({:.3f} to {:.3f})'.format(*of[name]) for name in AGGREGATES]
+        lines.append(f'| {learner} | {len(of["seeds"])} | {" | ".join(cells)} |')
+    lines += ['', f'| environment | {" | ".join(learners)} |', '|--|' + '--:|' * len(learners)]
+    for id in ids:
+        means = [np.mean([run[-1] for run in of['scores'][id]]) for of in learners.values()]
+        lines.append(f'| `{id}` | {" | ".join(f"{mean:.3f}" for mean in means)} |')
+    if found['improvement']:
+        lines += ['', '| A, B | probability that A is better |', '|--|--|']
+    for pair, values in found['improvement'].items():
+        lines.append('| {} | {:.2f} ({:.2f} to {:.2f}) |'.format(pair, *values))
+    return '\n'.join(lines)
