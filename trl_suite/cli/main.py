@@ -38,9 +38,7 @@ import trl_suite
 from trl_suite.util import program
 
 # In the order of the help.
-COMMANDS = (
-    'list info rollout view evaluate dataset terrain clip try_file doctor compile bench benchmark sequences'
-)
+COMMANDS = 'list info rollout view evaluate dataset terrain clip try_file doctor compile bench benchmark sequences'
 
 
 def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
