@@ -1,8 +1,8 @@
 """Random tests: invalid input is rejected by name, and single and vector environments agree.
 
-Hypothesis draws options, actions, numbers of simulations, states, and orders of calls. The fast tests always
-draw the same; the slow ones (`-m slow`) draw a seed, print it, and take it from FUZZ_SEED if that is set;
-FUZZ_EXAMPLES says how many.
+Hypothesis draws options, actions, numbers of simulations, states, and orders of calls. All are slow
+(`-m slow`): they draw a seed, print it, and take it from FUZZ_SEED if that is set; FUZZ_EXAMPLES
+says how many.
 """
 
 import dataclasses
@@ -64,13 +64,8 @@ arrays = st.one_of(
 )
 
 
-def many(test, examples):
-    """Runs a property test, always with the same draws."""
-    hypothesis.seed(0)(hypothesis.settings(max_examples=examples, **COMMON)(test))()
-
-
 def drawn(test, examples):
-    """The same with draws of a seed that is printed."""
+    """Runs a property test with draws of a seed that is printed."""
     seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
     print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={examples}')
     hypothesis.seed(seed)(hypothesis.settings(max_examples=examples, **COMMON)(test))()
@@ -97,15 +92,13 @@ def flat(time_step):
     return np.concatenate([block.ravel() for block in time_step.observation.values()])
 
 
-def check_option(task_type, name, value, step):
+def check_option(task_type, name, value):
     """An option is refused by its name, or the environment works with it."""
     type_ = TASK_TYPES[task_type]
     try:
         type_.config.parse(task_type, {name: value})
     except REFUSALS as error:
         assert name in str(error), f'{name}={value!r}: {error}'
-        return
-    if not step:
         return
     try:
         with warnings.catch_warnings():
@@ -125,12 +118,12 @@ def check_option(task_type, name, value, step):
     environment.close()
 
 
-def option_test(task_type, step):
+def option_test(task_type):
     names = [option.name for option in dataclasses.fields(TASK_TYPES[task_type].config)]
 
     @hypothesis.given(st.sampled_from(names), anything)
     def test(name, value):
-        check_option(task_type, name, value, step)
+        check_option(task_type, name, value)
 
     return test
 
@@ -266,7 +259,10 @@ def across_test(id_):
 
 
 class Calls(stateful.RuleBasedStateMachine):
-    """Some simulations and as many single environments are told the same, and do the same."""
+    """Some simulations and as many single environments are told the same, and do the same.
+
+    Environments are closed and made again in between.
+    """
 
     ID, REALISTIC, COUNT = GAPS, False, 3
     which = st.integers(0, COUNT - 1)
@@ -324,17 +320,6 @@ class Calls(stateful.RuleBasedStateMachine):
             world.qvel[k] = np.nan
             world.forward(np.array([k]))  # what was written is part of the state only then
 
-    @stateful.invariant()
-    def same(self):
-        for i, single in enumerate(self.singles):
-            info = self.environments.info
-            assert info['distance'][i] == single.info['distance']
-            assert info['diverged'][i] == single.info['diverged']
-
-
-class Reopened(Calls):
-    """The same, and environments are closed and made again in between."""
-
     @stateful.rule()
     def make_again(self):
         state, old = self.environments.get_state(), (self.environments, *self.singles)
@@ -349,42 +334,19 @@ class Reopened(Calls):
                     with pytest.raises(RuntimeError, match='the environment is closed'):
                         call()
 
-
-def machine(kind, id_, examples, steps, seed, realistic=False):
-    settings = hypothesis.settings(max_examples=examples, stateful_step_count=steps, **COMMON)
-    names = {'ID': id_, 'REALISTIC': realistic}
-    calls = hypothesis.seed(seed)(type(f'{kind.__name__}Of', (kind,), names))
-    stateful.run_state_machine_as_test(calls, settings=settings)
-
-
-class FastTest(parameterized.TestCase):
-    @parameterized.parameters(*TASK_TYPES)
-    def test_options(self, task_type):
-        many(option_test(task_type, False), 100)
-
-    def test_worlds_and_sensors(self):
-        many(disturbance_test(GAPS), 40)
-
-    def test_arguments(self):
-        many(argument_test(GAPS), 40)
-
-    def test_states(self):
-        many(state_test(GAPS), 40)
-
-    def test_calls(self):
-        machine(Calls, GAPS, 4, 20, 0)
-        machine(Calls, GAPS, 2, 20, 0, realistic=True)
-        machine(Reopened, GAPS, 1, 10, 1)
-
-    def test_states_across_options(self):
-        many(across_test(GAPS), 6)
+    @stateful.invariant()
+    def same(self):
+        for i, single in enumerate(self.singles):
+            info = self.environments.info
+            assert info['distance'][i] == single.info['distance']
+            assert info['diverged'][i] == single.info['diverged']
 
 
 @pytest.mark.slow
 class SlowTest(parameterized.TestCase):
     @parameterized.parameters(*TASK_TYPES)
     def test_options(self, task_type):
-        drawn(option_test(task_type, True), SLOW)
+        drawn(option_test(task_type), SLOW)
 
     @parameterized.parameters(*IDS)
     def test_worlds_and_sensors(self, id_):
@@ -406,7 +368,11 @@ class SlowTest(parameterized.TestCase):
     def test_calls(self, id_, realistic):
         seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
         print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={SLOW}')
-        machine(Reopened, id_, max(1, SLOW // 10), 30, seed, realistic)
+        examples = max(1, SLOW // 10)
+        settings = hypothesis.settings(max_examples=examples, stateful_step_count=30, **COMMON)
+        names = {'ID': id_, 'REALISTIC': realistic}
+        calls = hypothesis.seed(seed)(type('CallsOf', (Calls,), names))
+        stateful.run_state_machine_as_test(calls, settings=settings)
 
 
 if __name__ == '__main__':
