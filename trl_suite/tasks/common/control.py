@@ -133,9 +133,9 @@ def check_motion(character: Character, motion: Clip | FootstepLibrary) -> None:
     spec, root = character.spec, motion.layout.root
     if spec.spatial == (root == 'planar') or tuple(motion.joints) != tuple(spec.joints):
         raise ValueError(
-            f'motion {motion.name!r} (root {root}, joints {", ".join(motion.joints)}) does not fit '
-            f'character {spec.name!r}, whose root is {"free" if spec.spatial else "planar"} and whose '
-            f'joints are {", ".join(spec.joints)}'
+            f'motion {motion.name!r} ({root} root, joints {", ".join(motion.joints)}) does not fit '
+            f'character {spec.name!r}: expected one with a {"free" if spec.spatial else "planar"} root '
+            f'and joints {", ".join(spec.joints)}'
         )
     sizes = tuple(np.where(character.spherical, 4, 1).tolist())
     if motion.sizes != sizes:
@@ -152,7 +152,9 @@ def check_cycle(clip: Clip) -> None:
       ValueError: it does not.
     """
     if not clip.loop:
-        raise ValueError(f'clip {clip.name!r} does not loop; the task needs a looping clip')
+        raise ValueError(
+            f'clip {clip.name!r} is not looping: the task tracks no clip that does not loop'
+        )
 
 
 def cycle_poses(clip: Clip) -> np.ndarray:
