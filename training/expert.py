@@ -25,7 +25,6 @@ from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import CONTROLLER
 from trl_suite.tasks.navigation.plan_actions import STEP_LENGTH, plan_action_map
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
-from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
 REACH = 5.0  # m; half the map's side
@@ -111,7 +110,7 @@ class Map:
 
 
 def on_trail(
-    trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float, *, beyond: bool = False
+    trail: Any, place: np.ndarray, goal: np.ndarray, ahead: float, *, beyond: bool = False
 ) -> np.ndarray:
     """Returns the point of a trail `ahead` m closer to a goal, relative to `place`, (2,) m.
 
