@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import collections
 import functools
-import numbers
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +20,6 @@ from trl_suite.engine import PhysicsWorld, World
 from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.component import Component, position, seed_of
 from trl_suite.tasks.terms import Outcome, Term, outcome
-from trl_suite.util import errors
 
 if TYPE_CHECKING:
     from trl_suite.tasks.variation.levels import Levels
@@ -455,59 +453,6 @@ def random_displacement(random: np.random.Generator, low: float, high: float) ->
     """Draws a horizontal displacement with uniform direction and length in [low, high), (2,) m."""
     angle = random.uniform(-np.pi, np.pi)
     return random.uniform(low, high) * np.array([np.cos(angle), np.sin(angle)])
-
-
-def start_phases(
-    option: float | Sequence[Sequence[float]] | None,
-) -> Callable[[float], float]:
-    """Returns a function from a uniform draw in [0, 1) to the phase at the start of an episode.
-
-    Args:
-      option: None: the phase is the draw. A number in [0, 1): the phase is this number. Pairs of
-        numbers, ascending in [0, 1]: the phase is uniform in the union of these intervals.
-
-    Raises:
-      ValueError: anything else.
-    """
-    if option is None:
-        return lambda drawn: drawn
-    if isinstance(option, numbers.Real):
-        phase = float(option) if errors.is_number(option) else np.nan
-        if not 0 <= phase < 1:
-            raise ValueError(f'start_phase is {option}; expected a number in [0, 1), or pairs')
-        return lambda drawn: phase
-    try:
-        pairs = np.asarray(option, float)
-    except (TypeError, ValueError, OverflowError):
-        pairs = np.empty(0)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs) or not (
-        (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()
-        and pairs[0, 0] >= 0 and pairs[-1, 1] <= 1
-    ):  # fmt: skip
-        raise ValueError(
-            f'start_phase is {option}; expected a number in [0, 1), or ascending pairs '
-            'of numbers in [0, 1]'
-        )
-    ends = np.cumsum(np.diff(pairs, axis=1))
-
-    def phase_of(drawn: float) -> float:
-        covered = drawn * ends[-1]  # of the union of the intervals
-        i = min(int(np.searchsorted(ends, covered, side='right')), len(ends) - 1)
-        return float(pairs[i, 1] - (ends[i] - covered))
-
-    return phase_of
-
-
-def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
-    """Checks that options of position control are only given with this actuation model.
-
-    Raises:
-      ValueError: they are given with another one.
-    """
-    if model != 'position' and (action_offset != 'clip' or action_scale is not None):
-        raise ValueError(
-            f'action_offset and action_scale are options of position control, not {model} control'
-        )
 
 
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:

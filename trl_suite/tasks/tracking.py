@@ -25,7 +25,9 @@ from trl_suite.tasks.common.control import (
     PlanarConfig,
     SpatialConfig,
     check_motion,
+    check_position_options,
     position_range,
+    start_phases,
 )
 from trl_suite.tasks.common.reflection import action_reflection
 from trl_suite.tasks.common.rewards import comparison
@@ -41,9 +43,7 @@ from trl_suite.tasks.common.tracking_rules import (
 from trl_suite.tasks.task import (
     CONTROL_TIMESTEP,
     Task,
-    check_position_options,
     drawn_seed,
-    start_phases,
 )
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.util.compiled import packed

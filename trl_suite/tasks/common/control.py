@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+import numbers
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from trl_suite.tasks.task import (
     START_PHASE,
     SUBSTEPS,
     TERRAIN_LEVEL,
-    start_phases,
 )
+from trl_suite.util import errors
 from trl_suite.util.options import Config, option
 
 HEIGHT_MAP = "observed map of the terrain: 'height', or () for none"
@@ -196,3 +197,56 @@ def original_range(character: Character, action_scale: float | None) -> dict[str
     ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
     scale = 2 * (ranges[:, 1] - ranges[:, 0]) if action_scale is None else action_scale
     return {'action_offset': ranges.mean(1), 'action_scale': scale}
+
+
+def start_phases(
+    option: float | Sequence[Sequence[float]] | None,
+) -> Callable[[float], float]:
+    """Returns a function from a uniform draw in [0, 1) to the phase at the start of an episode.
+
+    Args:
+      option: None: the phase is the draw. A number in [0, 1): the phase is this number. Pairs of
+        numbers, ascending in [0, 1]: the phase is uniform in the union of these intervals.
+
+    Raises:
+      ValueError: anything else.
+    """
+    if option is None:
+        return lambda drawn: drawn
+    if isinstance(option, numbers.Real):
+        phase = float(option) if errors.is_number(option) else np.nan
+        if not 0 <= phase < 1:
+            raise ValueError(f'start_phase is {option}; expected a number in [0, 1), or pairs')
+        return lambda drawn: phase
+    try:
+        pairs = np.asarray(option, float)
+    except (TypeError, ValueError, OverflowError):
+        pairs = np.empty(0)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs) or not (
+        (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()
+        and pairs[0, 0] >= 0 and pairs[-1, 1] <= 1
+    ):  # fmt: skip
+        raise ValueError(
+            f'start_phase is {option}; expected a number in [0, 1), or ascending pairs '
+            'of numbers in [0, 1]'
+        )
+    ends = np.cumsum(np.diff(pairs, axis=1))
+
+    def phase_of(drawn: float) -> float:
+        covered = drawn * ends[-1]  # of the union of the intervals
+        i = min(int(np.searchsorted(ends, covered, side='right')), len(ends) - 1)
+        return float(pairs[i, 1] - (ends[i] - covered))
+
+    return phase_of
+
+
+def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
+    """Checks that options of position control are only given with this actuation model.
+
+    Raises:
+      ValueError: they are given with another one.
+    """
+    if model != 'position' and (action_offset != 'clip' or action_scale is not None):
+        raise ValueError(
+            f'action_offset and action_scale are options of position control, not {model} control'
+        )

@@ -20,14 +20,13 @@ from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.common.control import HEIGHT_MAP, maps, planar_heights
+from trl_suite.tasks.common.control import HEIGHT_MAP, check_position_options, maps, planar_heights
 from trl_suite.tasks.task import (
     CONTROL_TIMESTEP,
     MOST_SUBSTEPS,
     SUBSTEPS,
     TERRAIN_LEVEL,
     Task,
-    check_position_options,
 )
 from trl_suite.tasks.terms import Outcome, conclude
 from trl_suite.tasks.tracking import make_body
