@@ -186,7 +186,7 @@ class FiguresTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'task': 'gait'}, "'biped3d_mocap'"),
-        ({'clip': 'biped2d_walk'}, "'biped2d_walk'.*root is free"),
+        ({'clip': 'biped2d_walk'}, "'biped2d_walk'.*expected one with a free root"),
         ({'terrain': 'gaps'}, "'biped3d_mocap'.*'gaps'|'gaps'.*'biped3d_mocap'"),
         ({'actuation': 'muscle'}, "'biped3d_mocap' has no muscles"),
     )

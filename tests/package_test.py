@@ -41,6 +41,14 @@ def python(code, executable=sys.executable, cwd=None, **variables):
 class PinTest(absltest.TestCase):
     """Requirements of an installation."""
 
+    def test_versions_of_the_engine_are_pinned(self):
+        setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
+        required = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
+        # dm_control 1.0.50 asks for mujoco>=3.17 but cannot make a Physics on MuJoCo 4.0.0
+        # ('MjModel' object has no attribute 'flex_vertedge'), so an unpinned install is broken.
+        self.assertIn("'mujoco>=3.17,<4'", required)
+        self.assertIn("'dm-control>=1.0.50", required.replace('"', "'"))
+
     def test_constraints_fix_what_is_required(self):
         setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
         listed = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)

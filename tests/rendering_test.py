@@ -142,7 +142,7 @@ class GhostTest(parameterized.TestCase):
         environment = make(id_)
         model = environment.physics.model
         lift = environment.physics.data.qpos[1] - environment.task.reference_pose(0)[1]
-        self.assertBetween(lift, 0, 0.05)
+        self.assertBetween(lift, -1e-9, 0.05)  # the phase of the reference is rounded
         shown = {}
 
         def look(physics, scene):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from trl_suite import terrain as terrains
@@ -50,6 +51,16 @@ class EnvSpec:
     step_limit: int = STEP_LIMIT
     differences: tuple[str, ...] = ()
     own: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ('options', 'own'):  # the catalogue is shared by all, and must not change
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return EnvSpec, tuple(
+            dict(value) if isinstance(value, MappingProxyType) else value for value in values
+        )
 
     def part(self, name: str) -> Any:
         """Returns the custom object for a field if there is one, otherwise the field's name."""
