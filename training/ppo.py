@@ -369,7 +369,8 @@ class Trainer:
             self.average.module if averaged else self.policy, self.scales, places=self.places,
             activation=self.settings.activation, log_std=self.log_std.detach().numpy().copy(),
             mirror=self.mirror,
-            **networks.described(self.environments, self.seed, self.samples),
+            # The simulations may be of several environments.
+            **{**networks.described(self.environments, self.seed, self.samples), 'id': self.spec.id},
         )  # fmt: skip
 
     def evaluate(self, folder: pathlib.Path, divergence: float) -> None:
