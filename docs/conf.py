@@ -152,18 +152,20 @@ def is_code(block: str) -> bool:
 
 def render(app: Any) -> None:
     """Makes pictures that are missing, or that show a policy that has been replaced."""
-    from sphinx.errors import ConfigError  # the tests, which read this file, work without Sphinx
-
     try:
         _, failed = gallery.make(DOCS / 'pictures')
         if app.config.moving_pictures:
             failed |= gallery.make(DOCS, app.config.moving_pictures, moves=True)[1]
     except ValueError as error:
-        raise ConfigError(f'moving_pictures: {error}') from None
+        failed = {'moving_pictures': error}
     except RuntimeError as error:
         print(f'The site has fewer pictures: {error}', file=sys.stderr)
         return
     for path, error in failed.items():
+        from sphinx.errors import (
+            ConfigError,
+        )  # the tests, which read this file, work without Sphinx
+
         raise ConfigError(f'{path}: {error}') from error
 
 

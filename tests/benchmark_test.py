@@ -313,25 +313,25 @@ class Greedy(Nothing):
 
 class CommandTest(cli_test.CommandTest):
     def test_run_check_and_report(self):
-        pathlib.Path('my_learner.py').write_text(MODULE)
+        pathlib.Path('learner_of_benchmark.py').write_text(MODULE)
         self.addCleanup(setattr, sys, 'path', list(sys.path))
         command = (
             'benchmark', 'run', ID, '--budget', '60', '--episodes', '1', '--threads', '1', '--learner',
         )  # fmt: skip
         with mock.patch.object(evaluation, 'evaluate_all', self.made_up):
-            out = self.output(*command, 'my_learner:Nothing')
+            out = self.output(*command, 'learner_of_benchmark:Nothing')
             self.assertEqual(out, f'Nothing/{ID}_s0.json: score 0.500\n')
             self.assert_refused(
                 r'stage 0 \(PD_Biped2D_Gaps.*2 more samples; expected at most 1, since 2 of 3',
-                *command, 'my_learner:Greedy',
+                *command, 'learner_of_benchmark:Greedy',
             )  # fmt: skip
         path = f'Nothing/{ID}_s0.json'
         out = self.output('benchmark', 'check', path)
         self.assertRegex(
-            out, f'{path}: my_learner:Nothing, {ID}, budget 60.*not comparable: budget'
+            out, f'{path}: learner_of_benchmark:Nothing, {ID}, budget 60.*not comparable: budget'
         )
         out = self.output('benchmark', 'report', 'Nothing', '--json', 'report.json')
-        self.assertIn('| my_learner:Nothing | 1 | 0.500 (0.500 to 0.500) |', out)
+        self.assertIn('| learner_of_benchmark:Nothing | 1 | 0.500 (0.500 to 0.500) |', out)
         found = json.loads(pathlib.Path('report.json').read_text())
         self.assertEqual(found['environments'], [ID])
         self.assert_refused('there is no such file', 'benchmark', 'verify', 'Nothing')
@@ -346,7 +346,7 @@ class CommandTest(cli_test.CommandTest):
             'run',
             'PD_Gap',
             *command[3:],
-            'my_learner:Nothing',
+            'learner_of_benchmark:Nothing',
         )
 
     @staticmethod
