@@ -554,6 +554,11 @@ class RewardTest(parameterized.TestCase):
         gap = (task.steps.features[:, 4:] - query) * (0.54, 0.54, 0.48)
         self.assertEqual(int(task.state.track[0]), int((gap**2).sum(1).argmin()) + len(task.steps))
 
+    def test_single_steps_have_no_clip_to_follow(self):
+        environment, _ = started()
+        with self.assertRaisesRegex(ValueError, 'footsteps have no clip to follow'):
+            environment.task.clip_action(0)
+
     def test_the_reference_in_the_plane_begins_where_the_body_is(self):
         environment, _ = started(PLANAR, start_phase=0.3)
         task = environment.task

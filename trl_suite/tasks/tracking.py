@@ -390,13 +390,14 @@ class TrackingTask(ClockedTask):
         Raises:
           ValueError: torque and muscle control have no such action, and footsteps no clip.
         """
+        if not isinstance(self.motion, Clip):
+            raise ValueError('footsteps have no clip to follow')
         if self.actuation_model not in ('position', 'velocity'):
             raise ValueError(
                 f'{self.actuation_model} control cannot follow a clip open loop; position and '
                 'velocity control can'
             )
         clip, time = self.motion, self.phase[env_id] * self.period
-        assert isinstance(clip, Clip)
         if self.actuation_model == 'velocity':
             first = 3 if clip.root == 'planar' else 6
             action = self.action_map.action(clip.velocity(time)[first:])
