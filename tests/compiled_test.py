@@ -158,7 +158,7 @@ class FunctionTest(parameterized.TestCase):
 class NoticeTest(parameterized.TestCase):
     """What users are told while functions are compiled, and when they are not."""
 
-    COMPILING = 'compiling functions for this machine, once; it usually takes 10 to 30 s'
+    COMPILING = 'compiling functions for this machine, once; it usually takes 5 to 15 s'
 
     def setUp(self):
         super().setUp()
@@ -218,12 +218,12 @@ class NoticeTest(parameterized.TestCase):
         self.rest(3.0)
         self.assertEqual(self.told[1:], [
             'compiled in 1 s',
-            'waiting for another process that compiles functions; it usually takes 10 to 30 s', 'compiled in 9 s, 5 s of them by another process',
+            'waiting for another process that compiles functions; it usually takes 5 to 15 s', 'compiled in 9 s, 5 s of them by another process',
         ])  # fmt: skip
 
     def test_environments_and_how_long_they_took(self):
         """Also if parts are compiled by `make`, `reset` and `step`, with pauses."""
-        for last in ('it usually takes 10 to 30 s', 'it took 9 s the last time'):
+        for last in ('it usually takes 5 to 15 s', 'it took 9 s the last time'):
             self.compiling = notices.Compiling()  # as in a new process
             for name in ('dog', 'goat'):
                 self.compiling.about(name)
@@ -438,7 +438,7 @@ class CacheTest(FolderTest):
             {ASK}
             numba.njit(lambda x: x + 1.0)(1.0)
             time.sleep(0.5)"""
-        for last in ('it usually takes 10 to 30 s', 'it took [0-9]+ s the last time'):
+        for last in ('it usually takes 5 to 15 s', 'it took [0-9]+ s the last time'):
             out, told = self.start(script).communicate()
             self.assertEqual(out, '11.0\n')
             begin = f'trl_suite: compiling functions for this machine, once; {last}'

@@ -22,7 +22,7 @@ from trl_suite.util.compiled import cache_folder
 
 PATIENCE = 0.5  # s; of less compiling nothing is said
 PAUSE = 2.0  # s without compiling, after which it is over
-EXPECTED = 'it usually takes 10 to 30 s'
+EXPECTED = 'it usually takes 5 to 15 s'
 
 
 def print_to_stderr(text: str) -> None:
