@@ -1,13 +1,13 @@
 """Learner of the benchmark: ppo.py with its default settings, from a random policy.
 
-cd examples
+cd training
 trl-suite benchmark run PD_Biped2D_Gaps_Terrain-v0 --learner ppo_learner:SuitePPO
 """
 
 import dataclasses
 
-import checkpoints
 import ppo
+import runs
 import torch
 
 
@@ -31,9 +31,9 @@ class SuitePPO:
 
     def save(self, folder):
         state = {'samples': self.trainer.samples, **self.trainer.learnt()}
-        checkpoints.save(state, folder / 'learner.pt')
+        runs.save(state, folder / 'learner.pt')
 
     def load(self, folder):
-        state = checkpoints.load(folder / 'learner.pt')
+        state = runs.load(folder / 'learner.pt')
         self.trainer.samples = state['samples']
         self.trainer.set_learnt(state)

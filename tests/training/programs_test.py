@@ -20,6 +20,7 @@ import generalist
 import networks
 import numpy as np
 import ppo
+import ppo_learner
 import runs
 import settings
 import share_gaits
@@ -28,8 +29,9 @@ import train_randomized
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
-from trl_suite import characters, evaluation, policies
+from trl_suite import benchmark, characters, evaluation, policies
 from trl_suite.registry import catalogue
+from trl_suite.runs import Course
 from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
@@ -516,6 +518,23 @@ class TransferTest(parameterized.TestCase):
                     (flat.terrain, flat.character, dict(flat.options)),
                     ('flat', spec.character, dict(spec.options)),
                 )
+
+
+class LearnerTest(FolderTest):
+    def test_a_run_of_the_benchmark_continues_after_a_stop(self):
+        """PPO learns in two stages; what it has learnt is restored from its files."""
+        id_ = 'PD_Biped2D_Gaps_Terrain-v0'
+        course = Course(id_, (id_,), parts=2)
+        runs_ = dataclasses.replace(benchmark.BENCHMARK, courses={id_: course})
+        budget = 2 * ppo.Settings().num_envs * ppo.Settings().horizon
+        scores = {}
+        for name, ends in (('whole', (2,)), ('stopped', (1, 2))):
+            for stages in ends:
+                learner, path = ppo_learner.SuitePPO(course, 1), self.folder / f'{name}.json'
+                result = runs_.run(course, learner, budget, path, episodes=1, stages=stages)
+            scores[name] = result['scores']
+        self.assertEqual(scores['stopped'], scores['whole'])
+        self.assertNotEqual(scores['whole'][0], scores['whole'][1])
 
 
 class PlansTest(absltest.TestCase):
