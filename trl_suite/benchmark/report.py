@@ -19,12 +19,12 @@ from trl_suite.benchmark.core import CORE, normalised
 REPEATS = 2000  # bootstrap samples
 LEVELS = np.linspace(0, 1.2, 25)  # of performance profiles
 
-# Of normalised scores (..., runs * environments).
+# Of normalised scores (..., runs, environments).
 AGGREGATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    'iqm': lambda scores: stats.trim_mean(scores, 0.25, axis=-1),
-    'median': lambda scores: np.median(scores, -1),
-    'mean': lambda scores: np.mean(scores, -1),
-    'optimality_gap': lambda scores: 1 - np.minimum(scores, 1).mean(-1),
+    'iqm': lambda scores: stats.trim_mean(scores.reshape(*scores.shape[:-2], -1), 0.25, axis=-1),
+    'median': lambda scores: np.median(scores.mean(-2), -1),  # of the means of environments
+    'mean': lambda scores: scores.mean((-2, -1)),
+    'optimality_gap': lambda scores: 1 - np.minimum(scores, 1).mean((-2, -1)),
 }
 
 
@@ -116,13 +116,12 @@ def _interval(values: np.ndarray) -> list[Any]:
 
 
 def _estimates(scores: np.ndarray) -> dict[str, Any]:
-    samples = _samples(scores)
-    flat = samples.reshape(len(samples), -1, scores.shape[-1])
-    last = flat[..., -1]
-    profile = np.stack([(last > level).mean(-1) for level in LEVELS], -1)
+    samples = np.moveaxis(_samples(scores), -1, 1)  # (1 + REPEATS, parts, runs, environments)
+    last = samples[:, -1]
+    profile = np.stack([(last > level).mean((-2, -1)) for level in LEVELS], -1)
     return {
         **{name: _interval(function(last)) for name, function in AGGREGATES.items()},
-        'curve': _interval(AGGREGATES['iqm'](flat.swapaxes(1, 2))),
+        'curve': _interval(AGGREGATES['iqm'](samples)),
         'profile': _interval(profile),
     }
 
