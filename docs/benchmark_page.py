@@ -122,6 +122,7 @@ def page(found: dict[str, Any] | None, text: str) -> str:
         ('core', core(found)),
         ('results', results),
         ('leaderboard', leaderboard()),
+        ('levels', levels()),
     ):
         begin, end = f'<!-- {name}, written by docs/benchmark_page.py -->', f'<!-- /{name} -->'
         before, rest = text.split(begin)
