@@ -489,7 +489,9 @@ def solved() -> str:
             scores[spec.domain].append(papers.stored('shared')[spec.id]['evaluation'][score])
         elif entry := gallery.record(spec.id):
             run = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
-            scores[spec.domain].append(run['evaluation'][score])
+            # Of several seeds: other episodes than those in which one was chosen.
+            measured = entry.get('shipped_again', run['evaluation'])
+            scores[spec.domain].append(measured[score])
     medians = ', '.join(
         f'{statistics.median(found):{".0f" if domain in gaits else ".2f"}}{" m" * (domain in gaits)} (`{domain}`)'
         for domain, found in scores.items()
