@@ -492,13 +492,17 @@ def solved() -> str:
             # Of several seeds: other episodes than those in which one was chosen.
             measured = entry.get('shipped_again', run['evaluation'])
             scores[spec.domain].append(measured[score])
-    medians = ', '.join(
-        f'{statistics.median(found):{".0f" if domain in gaits else ".2f"}}{" m" * (domain in gaits)} (`{domain}`)'
-        for domain, found in scores.items()
+    shares, metres = (
+        ', '.join(
+            f'{statistics.median(found):{form}} (`{domain}`)'
+            for domain, found in scores.items()
+            if (domain in gaits) == distance
+        )
+        for distance, form in ((False, '.2f'), (True, '.0f'))
     )
     said = (
         f'{sum(map(len, scores.values()))} of {len(catalogue.SPECS)} environments have a trained policy. Median '
-        f'[scores](docs/results.md): {medians}.'
+        f'[scores](docs/results.md): {shares} of the largest return; to the first fall, in m, {metres}.'
     )
     return textwrap.fill(said, 112, break_on_hyphens=False)
 

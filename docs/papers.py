@@ -82,13 +82,13 @@ def action_spaces() -> str:
         samples = min(run['curve'][-1]['samples'] for each in runs for run in each)
         rows += [
             (motion, 'published', *published),
-            ('', f'ours, {samples / 1e6:.1f} M', *(returns(each, samples) for each in runs)),
+            ('', f'ours, AUC to {samples / 1e6:.1f} M', *(returns(each, samples) for each in runs)),
         ]  # fmt: skip
     return table(('motion', '', *MODELS.values()), rows)
 
 
 def returns(runs: list[dict[str, Any]], samples: int) -> str:
-    """Returns mean and deviation over the episodes of all seeds, and the area up to `samples`."""
+    """Returns mean and deviation over the episodes of all seeds, the area up to `samples`, and all samples."""
     if not runs:
         return '–'
     results = [run['evaluation'] for run in runs]
@@ -99,7 +99,8 @@ def returns(runs: list[dict[str, Any]], samples: int) -> str:
         points += [(each['samples'], each['normalized_return']) for each in run['curve']]
         x, y = np.transpose([each for each in points if each[0] <= samples])
         areas.append(np.trapezoid(y, x) / x[-1])
-    return f'{figure(shares.mean())} ± {figure(shares.std())} ({figure(np.mean(areas))})'
+    mean, deviation, area = map(figure, (shares.mean(), shares.std(), np.mean(areas)))
+    return f'{mean} ± {deviation} ({area}; {runs[0]["curve"][-1]["samples"] / 1e6:.1f} M)'
 
 
 def plaid(kind: int) -> str:

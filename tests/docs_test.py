@@ -166,12 +166,12 @@ class TablesTest(FolderTest):
                 generate.filled('page.md', {'d': 'new'})
 
     def test_returns_and_area_under_the_curve(self):
-        curve = [(100, 0.5), (200, 1.0), (300, 1.0)]
+        curve = [(100_000, 0.5), (200_000, 1.0), (300_000, 1.0)]
         run = {
             'curve': [{'samples': x, 'normalized_return': y} for x, y in curve],
             'evaluation': {'returns': [90.0, 110.0], 'step_limit': 200},
         }
-        self.assertEqual(papers.returns([run], 200), '.500 ± .050 (.500)')
+        self.assertEqual(papers.returns([run], 200_000), '.500 ± .050 (.500; 0.3 M)')
         self.assertEqual(papers.returns([], 200), '–')
         self.assertEqual([papers.figure(value) for value in (-0.0664, 1.5)], ['-.066', '1.500'])
 
