@@ -20,7 +20,7 @@ from helpers import (
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
-from trl_suite.tasks.common.plans import Plans, Pushes, StraightPlans
+from trl_suite.tasks.footsteps.planner import Plans, Pushes, StraightPlans
 from trl_suite.vector import VectorEnvironment
 
 PLANAR = 'PD_Biped2D_LLC_Flat_Step-v0'

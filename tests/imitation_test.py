@@ -6,7 +6,7 @@ from absl.testing import absltest, parameterized
 from helpers import assert_refused, assert_uniform, flattened, ground, made, put
 
 from trl_suite import motion, suite, terrain
-from trl_suite.tasks import terms
+from trl_suite.tasks import rewards
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
@@ -356,7 +356,7 @@ class RewardTest(parameterized.TestCase):
 
     def test_joint_angles_are_wrapped(self):
         angles = np.array([0.3, -3.0, 2 * np.pi + 0.3, -7.0, 3 * np.pi + 0.1])
-        found = [terms.wrapped(angle) for angle in angles]
+        found = [rewards.wrapped(angle) for angle in angles]
         np.testing.assert_allclose(found, wrapped(angles), atol=1e-12)
 
     @parameterized.product(id_=EXAMPLES, steps=(1, 6, 12))

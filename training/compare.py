@@ -33,7 +33,7 @@ import torch
 import tqdm
 
 from trl_suite import evaluation, policies, suite
-from trl_suite.tasks.task import CONTROL_TIMESTEP
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
 

@@ -24,9 +24,9 @@ import runs
 from expert import expert, joint_expert
 
 from trl_suite import policies
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.registry import catalogue
 from trl_suite.tasks.navigation.scripted import scripted
-from trl_suite.tasks.task import CONTROL_TIMESTEP
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment

@@ -13,9 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.characters import Character
+
 LEVELS = ('mild', 'robot', 'harsh')  # presets of sensors
 # Signs of a reflected vector, of a quaternion, and of a pseudovector such as an angular velocity.
 VECTOR, QUATERNION, SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
+
+ANGLE_AXIS = (1.0, -1.0, -1.0, 1.0)  # angle; forward, up, right
 
 
 CLOCK = "the phase is the controller's own clock"  # why a phase is exact
@@ -145,3 +150,22 @@ def reflected(blocks: Iterable[Block]) -> Reflection:
         sign.append(block.reflection.sign)
         start += block.size
     return Reflection(np.concatenate(index), np.concatenate(sign))
+
+
+def action_reflection(character: Character, action_map: ActionMap) -> Reflection:
+    """Returns the reflection of actions, i.e. joint targets or torques."""
+    spec = character.spec
+    joints = list(spec.joints)
+    ball = ANGLE_AXIS if action_map.has_axes else SPIN
+    starts: list[int] = []
+    signs: list[float] = []
+    for spherical in character.spherical.tolist():
+        starts.append(len(signs))
+        signs += ball if spherical else (1.0,)
+    index = np.arange(len(signs))
+    for a, b in spec.mirror:
+        i, j = (starts[joints.index(name)] for name in (a, b))
+        width = len(ball) if character.spherical[joints.index(a)] else 1
+        index[i : i + width] = np.arange(j, j + width)
+        index[j : j + width] = np.arange(i, i + width)
+    return Reflection(index, np.array(signs))

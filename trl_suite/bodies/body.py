@@ -101,6 +101,26 @@ def polar(i: int, x: float, y: float, measurement: Measurement) -> tuple[float, 
     return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
 
 
+class Travel(NamedTuple):
+    """Start and distance travelled of each body.
+
+    Attributes:
+      origin: x, y (m) and heading (rad) at the start, (n, 3).
+      distance: distance of the root from the start, (n,) m.
+    """
+
+    origin: np.ndarray = PLACE
+    distance: np.ndarray = REAL
+
+
+@compiled
+def go(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
+    """Writes the distance of the root from the start, along +x or in any horizontal direction."""
+    x = measurement.root[i, 0] - travel.origin[i, 0]
+    y = measurement.root[i, 1] - travel.origin[i, 1]
+    travel.distance[i] = x if along else np.sqrt(x * x + y * y)
+
+
 @compiled
 def is_broken(i: int, limit: float, body: Any) -> bool:
     """Returns whether a simulation has diverged, or a body turns faster than a limit, rad/s."""

@@ -1,21 +1,76 @@
-"""Reference motions of a body: features of a looping clip, or of single steps, over time."""
+"""Reference motions of a body: their clock, and features of a looping clip or of single steps."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from trl_suite.bodies.blocks import CLOCK, Block, Reflection
 from trl_suite.bodies.body import Body, Measurement, slices
-from trl_suite.bodies.state import allocated
+from trl_suite.bodies.state import REAL, WHOLE, allocated
 from trl_suite.engine.world import WRITABLE
 from trl_suite.motion import Clip, FootstepLibrary, quaternion
-from trl_suite.util.compiled import compiled_inline, nearest_index, packed
+from trl_suite.util.compiled import compiled, compiled_inline, nearest_index, packed
 
+CONTROL_TIMESTEP = 1 / 30  # s
+DIGITS = 1e9  # the clock is rounded to 1 / DIGITS of a cycle
+PHASE_BINS = 4  # parts of a cycle in the observation
 # Intervals of a cycle, of a planar or a spatial clip, and of a single step. For the suite's planar clips,
 # link positions are then exact to 0.5 mm.
 PLANAR_SAMPLES, SPATIAL_SAMPLES, STEP_SAMPLES = 1024, 256, 64
+
+
+class Clock(NamedTuple):
+    """Phase of each simulation in the cycle of its reference motion, (n,).
+
+    Attributes:
+      start: phase at the start of the episode.
+      steps: control steps since the start.
+      cycles: time in periods of the motion: the phase, not wrapped.
+      phase: phase in [0, 1).
+    """
+
+    start: np.ndarray = REAL
+    steps: np.ndarray = WHOLE
+    cycles: np.ndarray = REAL
+    phase: np.ndarray = REAL
+
+
+@compiled
+def tick(i: int, period: float, clock: Clock) -> None:
+    """Advances a clock of this period, s, by a control step."""
+    clock.steps[i] += 1
+    cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / period)
+    # Rounded, so that rounding errors of the sum do not delay the switch of stance at half a cycle.
+    clock.cycles[i] = np.rint(cycles * DIGITS) / DIGITS
+    clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
+
+
+@compiled
+def observe_phase(i: int, columns: Any, clock: Clock, observation: np.ndarray) -> None:
+    """Writes the block `PHASE`."""
+    if columns.phase >= 0:
+        phase = clock.phase[i]
+        observation[i, columns.phase] = phase
+        for k in range(PHASE_BINS):
+            observation[i, columns.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
+
+
+# Its phase is that of the cycle; a mirrored observation has that of the step.
+PHASE = Block(
+    'phase',
+    1 + PHASE_BINS,
+    '1',
+    'phase of the cycle in [0, 1); then the one-hot of its quarter',
+    CLOCK,
+    Reflection(
+        np.append(0, 1 + np.roll(np.arange(PHASE_BINS), PHASE_BINS // 2)), np.ones(1 + PHASE_BINS)
+    ),
+    kept=tuple(range(1 + PHASE_BINS // 2)),
+    kept_meaning='phase of the step in [0, 1); then the one-hot of its half',
+)
 
 
 class TrackTable(NamedTuple):

@@ -13,8 +13,8 @@ from trl_suite.engine import World
 from trl_suite.util.random import Streams
 
 if TYPE_CHECKING:
+    from trl_suite.tasks.rewards import Outcome
     from trl_suite.tasks.task import Marker, Task
-    from trl_suite.tasks.terms import Outcome
 
 
 # Spawn keys of the streams of components.

@@ -19,7 +19,7 @@ from trl_suite.bodies.blocks import Block, layout
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.component import Component, position, seed_of
-from trl_suite.tasks.terms import Outcome, Term, outcome
+from trl_suite.tasks.rewards import Outcome, Term, outcome
 
 if TYPE_CHECKING:
     from trl_suite.tasks.variation.levels import Levels
@@ -33,9 +33,7 @@ START_PHASE = (
 )
 TERRAIN_LEVEL = "index of the terrain's parameter set; fractions interpolate: 0.5 is half-way between sets 0 and 1"
 SPAWNS = ('intended', 'upstream')
-CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
-PHASE_BINS = 4  # parts of a cycle in the observation
 ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 
 

@@ -11,10 +11,18 @@ import numpy as np
 from trl_suite import actuation
 from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.arenas import PlanarArena, SpatialArena
-from trl_suite.bodies.blocks import Block, columns, layout, reflected
-from trl_suite.bodies.body import Body
+from trl_suite.bodies.blocks import Block, action_reflection, columns, layout, reflected
+from trl_suite.bodies.body import Body, Measurement, Travel, go
 from trl_suite.bodies.planar import PlanarBody
-from trl_suite.bodies.reference import Reference, joint_targets
+from trl_suite.bodies.reference import (
+    CONTROL_TIMESTEP,
+    DIGITS,
+    PHASE,
+    Clock,
+    Reference,
+    joint_targets,
+    tick,
+)
 from trl_suite.bodies.spatial import SpatialBody
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
@@ -29,24 +37,10 @@ from trl_suite.tasks.common.control import (
     position_range,
     start_phases,
 )
-from trl_suite.tasks.common.reflection import action_reflection
-from trl_suite.tasks.common.rewards import comparison
-from trl_suite.tasks.common.tracking_rules import (
-    DIGITS,
-    PHASE,
-    Clock,
-    TrackingData,
-    Travel,
-    View,
-    reflect_all,
-)
-from trl_suite.tasks.task import (
-    CONTROL_TIMESTEP,
-    Task,
-    drawn_seed,
-)
+from trl_suite.tasks.rewards import Comparison, Outcome, comparison
+from trl_suite.tasks.task import Task, drawn_seed
 from trl_suite.terrain import PlanarGround, SpatialGround
-from trl_suite.util.compiled import packed
+from trl_suite.util.compiled import compiled, compiled_inline, packed
 
 VIEW_BEHIND, VIEW_AHEAD = 0.5, 3.0  # m; range of observed ground heights in the plane
 
@@ -420,3 +414,94 @@ class Full(NamedTuple):
     """The full observation, as part of the state of a task, (n, size)."""
 
     observation: np.ndarray
+
+
+class View(NamedTuple):
+    """The full observation, and what of it is observed, with optional mirroring in left stance.
+
+    Attributes:
+      full: the full observation, (n, size).
+      columns: first columns of its blocks; -1: absent.
+      mirrored: whether observations and actions are reflected in left stance.
+      source, sign: a reflected full observation is `full[source] * sign`, (size,).
+      kept: columns of the full observation that are observed, (k,); all of them if it is empty.
+      given_phase: column of the phase in the observation.
+      action_source, action_sign: a reflected action is `action[source] * sign`.
+      action: actions after reflection, (n, k); scratch.
+    """
+
+    full: np.ndarray
+    columns: Any
+    mirrored: bool
+    source: np.ndarray
+    sign: np.ndarray
+    kept: np.ndarray
+    given_phase: int
+    action_source: np.ndarray
+    action_sign: np.ndarray
+    action: np.ndarray
+
+
+class TrackingData(NamedTuple):
+    """Data for the compiled functions of tasks that track a reference motion.
+
+    Attributes:
+      measurement: of the bodies, which write their own blocks to `given.full`.
+      diverged: whether the physics has diverged in the last step, (n,).
+      period: that of the motion, s.
+      along: whether the distance travelled is along +x, not in any horizontal direction.
+    """
+
+    measurement: Measurement
+    diverged: np.ndarray
+    outcome: Outcome
+    given: View
+    clock: Clock
+    travel: Travel
+    period: float
+    along: bool
+    comparison: Comparison
+
+
+@compiled
+def proceed(i: int, data: TrackingData) -> bool:
+    """Advances clock and distance; returns False if the physics has diverged."""
+    tick(i, data.period, data.clock)
+    data.outcome.diverged[i] = data.diverged[i]
+    if data.diverged[i]:
+        return False
+    go(i, data.along, data.measurement, data.travel)
+    return True
+
+
+@compiled_inline
+def in_left_stance(i: int, view: View) -> bool:
+    """Returns whether observation and action are reflected."""
+    return view.mirrored and view.full[i, view.columns.phase] >= 0.5
+
+
+@compiled
+def publish(i: int, view: View, outcome: Outcome) -> None:
+    """Writes the observation from the full observation."""
+    full, observation, left = view.full, outcome.observation, in_left_stance(i, view)
+    for k in range(len(view.kept)):
+        column = view.kept[k]
+        if left:
+            observation[i, k] = full[i, view.source[column]] * view.sign[column]
+        else:
+            observation[i, k] = full[i, column]
+    if view.mirrored:  # the phase of the single step
+        phase = full[i, view.columns.phase]
+        observation[i, view.given_phase] = 2 * (phase - 0.5 if left else phase)
+
+
+@compiled
+def reflect_all(env_ids: np.ndarray, action: np.ndarray, view: View) -> None:
+    """Writes `view.action`: actions, which are reflected in left stance. Takes a pack."""
+    for i in env_ids:
+        left = in_left_stance(i, view)
+        for k in range(view.action.shape[1]):
+            if left:
+                view.action[i, k] = action[i, view.action_source[k]] * view.action_sign[k]
+            else:
+                view.action[i, k] = action[i, k]

@@ -15,12 +15,13 @@ import numpy as np
 from trl_suite.arenas import SpatialArena
 from trl_suite.bodies.blocks import SPIN, VECTOR, Block, Noise, signs
 from trl_suite.bodies.body import Measurement, ahead_and_left, polar
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.bodies.spatial import SpatialState
 from trl_suite.bodies.state import FLAG, PLACE, WHOLE, allocated
 from trl_suite.engine import World
 from trl_suite.tasks.common.goals import GOAL, GOAL_AWAY, GOAL_COLOUR
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, random_displacement
-from trl_suite.tasks.terms import Outcome, Term, give, terms_data
+from trl_suite.tasks.rewards import Outcome, Term, give, terms_data
+from trl_suite.tasks.task import Marker, random_displacement
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline
 

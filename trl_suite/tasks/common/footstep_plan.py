@@ -11,13 +11,15 @@ from trl_suite.bodies.blocks import VECTOR, Block, Noise, Reflection
 from trl_suite.bodies.body import Measurement, ahead_and_left
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
+from trl_suite.motion import FootstepLibrary
+from trl_suite.tasks.rewards import wrapped
 from trl_suite.tasks.task import Marker
-from trl_suite.tasks.terms import wrapped
 from trl_suite.util.compiled import compiled
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
 SIDE = np.array([-1.0, 1.0])  # sign of y of each foot
 PLAN_SIZE = 13
+TYPICAL_POSES = 31  # poses of a step; their mean is action 0 of position control
 CONTACT = Block(
     'contact',
     2,
@@ -170,3 +172,27 @@ def check_two_feet(spec: CharacterSpec) -> None:
     """
     if len(spec.end_effectors) != 2:
         raise ValueError(f'character {spec.name!r} does not have two end effectors as feet')
+
+
+# The single step from which episodes start.
+
+
+def straight_step(steps: FootstepLibrary, length: float) -> int:
+    """Returns the straight step of a library whose length is nearest to `length`, m."""
+    straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
+    return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
+
+
+def pose_of_step(
+    steps: FootstepLibrary, step: int, phase: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses with x = y = 0, and rates, at phases (m,) of a step and its mirror image."""
+    times = (2 * phase - np.floor(2 * phase)) * steps.duration
+    poses, rates = (part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity))
+    poses[:, :2] = 0.0
+    return poses, rates
+
+
+def typical_poses(steps: FootstepLibrary, step: int) -> np.ndarray:
+    """Returns poses of a step whose mean is action 0, (k, columns of a pose)."""
+    return steps.pose(step, np.linspace(0, steps.duration, TYPICAL_POSES))

@@ -8,9 +8,12 @@ import numpy as np
 
 from trl_suite.arenas import SpatialArena
 from trl_suite.bodies.blocks import Block, Noise, signs
+from trl_suite.bodies.body import Measurement, polar
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.bodies.state import FLAG, PLACE, WHOLE
 from trl_suite.engine import World
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker, random_displacement
+from trl_suite.tasks.task import Marker, random_displacement
+from trl_suite.util.compiled import compiled
 
 if TYPE_CHECKING:
     from trl_suite.tasks.common.ball import Ball
@@ -18,6 +21,10 @@ if TYPE_CHECKING:
 GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is redrawn
 GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
 GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)
+TRACE_EVERY = 5  # control steps between two stored positions
+TRACE_PLACES = 60  # stored positions: 10 s
+TRACE_RADIUS = 0.025  # of the markers, m
+TRACE_COLOUR = (0.98, 0.75, 0.1, 0.9)
 FLAG_SIZE = (0.1, 0.6, 0.0)  # m; marker of the goal: radius and half height of a cylinder
 
 
@@ -45,6 +52,15 @@ GOAL = Block(
     Noise((0.01, 0.03, 0.1)),
     signs((-1.0, 1.0)),
 )
+
+
+@compiled
+def observe_place(
+    i: int, column: int, x: float, y: float, measurement: Measurement, observation: np.ndarray
+) -> None:
+    """Writes bearing and distance of a place x, y m from the root, in world axes."""
+    bearing, distance = polar(i, x, y, measurement)
+    observation[i, column], observation[i, column + 1] = bearing, distance
 
 
 def flag(goal: Any) -> Marker:
@@ -125,3 +141,37 @@ class GoalDrawer:
         self._goals.place[i] = goal
         lasts = random.uniform(*GOAL_LASTS)
         self._goals.due[i] = self._steps[i] + round(lasts / CONTROL_TIMESTEP)
+
+
+# Past positions of a body, for rendering.
+
+
+class Trace(NamedTuple):
+    """The last positions of n bodies.
+
+    Attributes:
+      places: (n, TRACE_PLACES, 3) m, a ring buffer; NaN where no position has been stored yet.
+    """
+
+    places: np.ndarray
+
+
+def trace(n: int) -> Trace:
+    """Allocates the trace of n bodies."""
+    return Trace(np.full((n, TRACE_PLACES, 3), np.nan))
+
+
+@compiled
+def follow(i: int, count: int, place: np.ndarray, trace: Trace) -> None:
+    """Stores the position of body i, from `place` (n, 3) m, after `count` control steps."""
+    if count % TRACE_EVERY == 0:
+        for k in range(3):
+            trace.places[i, count // TRACE_EVERY % TRACE_PLACES, k] = place[i, k]
+
+
+def trace_markers(env_id: int, trace: Trace) -> list[Marker]:
+    """Returns spheres at the stored positions of a body."""
+    places, size = trace.places[env_id], (TRACE_RADIUS,) * 3
+    return [
+        Marker('sphere', place, size, TRACE_COLOUR) for place in places[np.isfinite(places[:, 0])]
+    ]

@@ -1,8 +1,7 @@
 """Tasks that walk along planned footsteps."""
 
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.common import differences
-from trl_suite.tasks.common.differences import Difference
+from trl_suite.tasks import task_type as differences
 from trl_suite.tasks.footsteps import description
 from trl_suite.tasks.footsteps.task import (
     PlanarFootsteps,
@@ -10,7 +9,7 @@ from trl_suite.tasks.footsteps.task import (
     SpatialFootsteps,
     SpatialFootstepsConfig,
 )
-from trl_suite.tasks.task_type import TaskType, tracking
+from trl_suite.tasks.task_type import Difference, TaskType, tracking
 
 TYPES = (
     TaskType(

@@ -7,19 +7,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.bodies.reference import feature, moment
+from trl_suite.bodies.body import go
+from trl_suite.bodies.reference import feature, moment, observe_phase
 from trl_suite.bodies.state import FLAG, PLACE, POINT, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
-from trl_suite.tasks.common.rewards import HEADING_WEIGHT, STEP_TERMS, com_error, motion_errors
-from trl_suite.tasks.common.tracking_rules import (
-    TrackingData,
-    go,
-    observe_phase,
-    observe_place,
-    proceed,
-    publish,
+from trl_suite.tasks.common.goals import observe_place
+from trl_suite.tasks.rewards import (
+    HEADING_WEIGHT,
+    STEP_TERMS,
+    Term,
+    com_error,
+    conclude,
+    facing,
+    give,
+    motion_errors,
+    score,
+    wrapped,
 )
-from trl_suite.tasks.terms import Term, conclude, facing, give, score, wrapped
+from trl_suite.tasks.tracking import TrackingData, proceed, publish
 from trl_suite.util.compiled import compiled
 
 HEADING = Term(

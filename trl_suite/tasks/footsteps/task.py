@@ -16,13 +16,12 @@ import numpy as np
 
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.body import Measurement
-from trl_suite.bodies.reference import Reference
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, Reference
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
 from trl_suite.motion import Clip, FootstepLibrary, quaternion, step_features
 from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig, check_cycle, cycle_poses
-from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     LEFT,
@@ -32,16 +31,19 @@ from trl_suite.tasks.common.footstep_plan import (
     Planned,
     check_two_feet,
     plan_markers,
+    pose_of_step,
+    straight_step,
+    typical_poses,
 )
 from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
-from trl_suite.tasks.common.plans import (
+from trl_suite.tasks.footsteps.planner import (
     FOOTSTEP_SCALE,
     MAX_LANDING_ERROR,
+    Planner,
     Plans,
     Pushes,
     StraightPlans,
 )
-from trl_suite.tasks.footsteps.planner import Planner
 from trl_suite.tasks.footsteps.rules import (
     PLANAR_TERMS,
     TERMS,
@@ -52,7 +54,7 @@ from trl_suite.tasks.footsteps.rules import (
     land_all,
     observe_all,
 )
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
+from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Range, option

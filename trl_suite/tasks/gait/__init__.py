@@ -1,10 +1,9 @@
 """The TerrainRL family: actions set the parameters of a gait state machine."""
 
-from trl_suite.tasks.common import differences
-from trl_suite.tasks.common.differences import Difference
+from trl_suite.tasks import task_type as differences
 from trl_suite.tasks.gait.description import GAIT
 from trl_suite.tasks.gait.task import GaitConfig, GaitTask
-from trl_suite.tasks.task_type import TaskType
+from trl_suite.tasks.task_type import Difference, TaskType
 
 TYPES = (
     TaskType(

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.tasks.common import description, falls
+from trl_suite.tasks.common import description
 from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
+from trl_suite.tasks.rewards import fall_condition
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
 
@@ -123,7 +124,7 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     yield description.reward(task, *notes, title='Reward of a cycle')
     links = ', '.join(figure.fall_links)
     ends = [
-        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} {falls.condition()}',
+        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} {fall_condition()}',
         f'the pitch of the root is more than {np.degrees(gait_rules.TURNED):.0f} degrees',
         f'the root has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
         'the physics diverges',

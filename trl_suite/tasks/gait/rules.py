@@ -22,8 +22,16 @@ from trl_suite.controllers import CONTROL_TIMESTEP, gaits
 from trl_suite.controllers.machine import GaitRules, touches
 from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
-from trl_suite.tasks.common import falls
-from trl_suite.tasks.terms import Outcome, Term, begin, conclude, give, score
+from trl_suite.tasks.rewards import (
+    FALL_THRESHOLD,
+    Outcome,
+    Term,
+    begin,
+    conclude,
+    give,
+    sample_fall,
+    score,
+)
 from trl_suite.util.compiled import compiled
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
@@ -225,11 +233,11 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 def judge(i: int, data: GaitData) -> None:
     """Tests whether the episode has failed."""
     state, ids, physics = data.state, data.body.ids, data.body.physics
-    falls.sample(i, any_touches(i, data.options.fall, data.gait), state.down)
+    sample_fall(i, any_touches(i, data.options.fall, data.gait), state.down)
     pitch = physics.qpos[i, ids.qpos[2]]
     turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
     backwards = data.options.forward_only and physics.qvel[i, ids.dof[0]] < 0.0
-    state.fell[i] = state.down[i] > falls.THRESHOLD or turn > TURNED or backwards
+    state.fell[i] = state.down[i] > FALL_THRESHOLD or turn > TURNED or backwards
     if state.age[i] % _PATIENCE_STEPS == 0:
         x, z = physics.qpos[i, ids.qpos[0]], physics.qpos[i, ids.qpos[1]]
         moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])

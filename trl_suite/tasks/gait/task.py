@@ -43,6 +43,7 @@ from trl_suite.tasks.gait.rules import (
     observed_blocks,
     run,
 )
+from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import (
     MOST_SUBSTEPS,
     SPAWNS,
@@ -50,7 +51,6 @@ from trl_suite.tasks.task import (
     Task,
     check_simulated,
 )
-from trl_suite.tasks.terms import terms_data
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Config, option

@@ -1,8 +1,7 @@
 """Tasks that track a motion clip."""
 
 from trl_suite.motion import Clip
-from trl_suite.tasks.common import differences
-from trl_suite.tasks.common.differences import Difference
+from trl_suite.tasks import task_type as differences
 from trl_suite.tasks.imitation.description import IMITATION
 from trl_suite.tasks.imitation.task import (
     PlanarImitation,
@@ -10,7 +9,7 @@ from trl_suite.tasks.imitation.task import (
     SpatialImitation,
     SpatialImitationConfig,
 )
-from trl_suite.tasks.task_type import TaskType, tracking
+from trl_suite.tasks.task_type import Difference, TaskType, tracking
 
 TYPES = (
     TaskType(

@@ -16,24 +16,22 @@ import numpy as np
 from trl_suite.actuation.muscles import PLAIN
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block
-from trl_suite.bodies.reference import Reference, feature, moment
+from trl_suite.bodies.body import go
+from trl_suite.bodies.reference import Reference, feature, moment, observe_phase
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import Clip
-from trl_suite.tasks.common import rewards
+from trl_suite.tasks import rewards
 from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig, check_cycle, cycle_poses
-from trl_suite.tasks.common.goals import GOAL
-from trl_suite.tasks.common.rewards import com_error, effector_error, motion_errors, score_tracking
-from trl_suite.tasks.common.tracking_rules import (
-    TrackingData,
-    go,
-    observe_phase,
-    observe_place,
-    proceed,
-    publish,
+from trl_suite.tasks.common.goals import GOAL, observe_place
+from trl_suite.tasks.rewards import (
+    com_error,
+    conclude,
+    effector_error,
+    motion_errors,
+    score_tracking,
 )
-from trl_suite.tasks.terms import conclude
-from trl_suite.tasks.tracking import TrackingTask
+from trl_suite.tasks.tracking import TrackingData, TrackingTask, proceed, publish
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import option
 

@@ -4,9 +4,8 @@ from typing import Any
 
 from trl_suite import motion
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.common import differences
+from trl_suite.tasks import task_type as differences
 from trl_suite.tasks.common.ball import Ball
-from trl_suite.tasks.common.differences import Difference
 from trl_suite.tasks.navigation import description
 from trl_suite.tasks.navigation.direct import (
     DirectConfig,
@@ -16,7 +15,7 @@ from trl_suite.tasks.navigation.direct import (
 )
 from trl_suite.tasks.navigation.hierarchical import HierarchicalConfig, HierarchicalNavigation
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.task_type import Parts, TaskType, tracking
+from trl_suite.tasks.task_type import Difference, Parts, TaskType, tracking
 
 
 def _direct(parts: Parts, config: Any) -> Task:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from trl_suite.tasks.common import ball, description, falls, spatial_description
+from trl_suite.tasks.common import ball, description, spatial_description
 from trl_suite.tasks.common.description import floats
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
 from trl_suite.tasks.navigation import direct, hierarchical_rules
+from trl_suite.tasks.rewards import fall_condition
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
 
@@ -67,7 +68,7 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
     every = hierarchical_rules.SAMPLE_FRAMES / 30
     yield section(
         f'Termination (discount 0), sampled every {every:g} s',
-        f'one of {", ".join(task.character.spec.fall_links)} {falls.condition()}; or the physics diverges',
+        f'one of {", ".join(task.character.spec.fall_links)} {fall_condition()}; or the physics diverges',
     )
 
 

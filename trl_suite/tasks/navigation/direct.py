@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
-from trl_suite.bodies.reference import Reference, moment
+from trl_suite.bodies.body import go
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, Reference, moment, observe_phase
 from trl_suite.bodies.spatial import SpatialState
 from trl_suite.bodies.state import REAL, allocated
 from trl_suite.characters import Character
@@ -34,28 +35,34 @@ from trl_suite.tasks.common.ball import (
     soccer_terms,
 )
 from trl_suite.tasks.common.control import HEIGHT_MAP, SpatialConfig, check_cycle, cycle_poses
-from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag
-from trl_suite.tasks.common.plans import Plans
-from trl_suite.tasks.common.rewards import (
+from trl_suite.tasks.common.goals import (
+    GOAL,
+    GoalDrawer,
+    Goals,
+    Trace,
+    flag,
+    follow,
+    observe_place,
+    trace,
+    trace_markers,
+)
+from trl_suite.tasks.footsteps.planner import Plans
+from trl_suite.tasks.footsteps.task import SpatialFootsteps, SpatialFootstepsConfig
+from trl_suite.tasks.rewards import (
+    Term,
     com_error,
+    conclude,
     effector_error,
+    facing,
+    give,
     motion_errors,
+    score,
     score_tracking,
     tracking_terms,
+    wrapped,
 )
-from trl_suite.tasks.common.trace import Trace, follow, trace, trace_markers
-from trl_suite.tasks.common.tracking_rules import (
-    TrackingData,
-    go,
-    observe_phase,
-    observe_place,
-    proceed,
-    publish,
-)
-from trl_suite.tasks.footsteps.task import SpatialFootsteps, SpatialFootstepsConfig
-from trl_suite.tasks.task import CONTROL_TIMESTEP, Marker
-from trl_suite.tasks.terms import Term, conclude, facing, give, score, wrapped
-from trl_suite.tasks.tracking import TrackingTask
+from trl_suite.tasks.task import Marker
+from trl_suite.tasks.tracking import TrackingData, TrackingTask, proceed, publish
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Range, option
 

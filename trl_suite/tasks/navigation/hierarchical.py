@@ -14,6 +14,7 @@ import numpy as np
 
 from trl_suite.arenas import SpatialArena
 from trl_suite.bodies.blocks import Block, columns, layout
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, PHASE
 from trl_suite.bodies.spatial import body_blocks
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
@@ -30,7 +31,6 @@ from trl_suite.tasks.common.ball import (
     soccer_terms,
 )
 from trl_suite.tasks.common.control import maps
-from trl_suite.tasks.common.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
@@ -38,11 +38,12 @@ from trl_suite.tasks.common.footstep_plan import (
     Planned,
     check_two_feet,
     plan_markers,
+    pose_of_step,
+    straight_step,
+    typical_poses,
 )
-from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag
-from trl_suite.tasks.common.plans import Plans
-from trl_suite.tasks.common.trace import trace, trace_markers
-from trl_suite.tasks.common.tracking_rules import PHASE
+from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag, trace, trace_markers
+from trl_suite.tasks.footsteps.planner import Plans
 from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,
@@ -67,8 +68,8 @@ from trl_suite.tasks.navigation.plan_actions import (
     plan_action_map,
     planning_mirror,
 )
+from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import (
-    CONTROL_TIMESTEP,
     MOST_SUBSTEPS,
     SUBSTEPS,
     TERRAIN_LEVEL,
@@ -76,7 +77,6 @@ from trl_suite.tasks.task import (
     check_simulated,
     drawn_seed,
 )
-from trl_suite.tasks.terms import terms_data
 from trl_suite.tasks.tracking import ClockedTask
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import packed

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
-from trl_suite.bodies.body import MAX_JOINT_SPEED
+from trl_suite.bodies.body import MAX_JOINT_SPEED, Travel, go
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
 from trl_suite.bodies.spatial import (
     LINES,
     SpatialBodyData,
@@ -17,21 +18,10 @@ from trl_suite.bodies.spatial import (
     observe_body,
 )
 from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE
-from trl_suite.tasks.common import falls
 from trl_suite.tasks.common.ball import BallData, dribble, observe_ball, remember
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
-from trl_suite.tasks.common.goals import Goals
-from trl_suite.tasks.common.trace import Trace, follow
-from trl_suite.tasks.common.tracking_rules import (
-    Clock,
-    Travel,
-    go,
-    observe_phase,
-    observe_place,
-    tick,
-)
-from trl_suite.tasks.task import CONTROL_TIMESTEP
-from trl_suite.tasks.terms import Outcome, Term, conclude, give
+from trl_suite.tasks.common.goals import Goals, Trace, follow, observe_place
+from trl_suite.tasks.rewards import FALL_THRESHOLD, Outcome, Term, conclude, give, sample_fall
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_inline
@@ -203,8 +193,8 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     look(i, data)
     count, measurement = data.clock.steps[i], body.measurement
     if count % SAMPLE_FRAMES == 0:
-        falls.sample(i, measurement.fallen[i], state.down)
-    outcome.failed[i] = state.down[i] > falls.THRESHOLD
+        sample_fall(i, measurement.fallen[i], state.down)
+    outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
     follow(i, count, measurement.com, data.trace)

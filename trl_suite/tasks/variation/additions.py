@@ -21,7 +21,7 @@ import numpy as np
 from trl_suite.bodies.blocks import Block
 from trl_suite.engine import World
 from trl_suite.tasks.component import Component
-from trl_suite.tasks.terms import Outcome, outcome
+from trl_suite.tasks.rewards import Outcome, outcome
 from trl_suite.util import errors
 
 if TYPE_CHECKING:

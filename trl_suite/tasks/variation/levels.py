@@ -9,8 +9,8 @@ import numpy as np
 
 from trl_suite.engine import World
 from trl_suite.tasks.component import LEVELS, Component, spawned
+from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.terms import Outcome
 from trl_suite.util.options import checked
 
 MOST = 2**32  # levels are below

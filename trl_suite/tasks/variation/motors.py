@@ -15,8 +15,8 @@ from trl_suite.tasks.component import MOTORS, Component, spawned
 from trl_suite.util import random
 
 if TYPE_CHECKING:
+    from trl_suite.tasks.rewards import Outcome
     from trl_suite.tasks.task import Task
-    from trl_suite.tasks.terms import Outcome
 
 
 class Motors(Component):

@@ -17,8 +17,8 @@ import numpy as np
 from trl_suite.bodies.blocks import LEVELS, Block, layout
 from trl_suite.engine import World
 from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
+from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.terms import Outcome
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, Range, checked, option

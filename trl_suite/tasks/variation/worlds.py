@@ -18,8 +18,8 @@ from trl_suite.engine.pushes import DIRECTION, DURATION, FORCE, INTERVAL
 from trl_suite.engine.pushes import draw as draw_push
 from trl_suite.engine.variation import Properties, Variation
 from trl_suite.tasks.component import PUSH, WORLD, Component, seeded, spawned
+from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Marker, Task
-from trl_suite.tasks.terms import Outcome
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
 from trl_suite.util.options import Config, Range, option

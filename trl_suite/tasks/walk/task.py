@@ -14,21 +14,15 @@ from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block, Noise, columns
 from trl_suite.bodies.body import Measurement
-from trl_suite.bodies.reference import link_extents
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, link_extents
 from trl_suite.bodies.state import POINT, REAL, allocated
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.common.control import HEIGHT_MAP, check_position_options, maps, planar_heights
-from trl_suite.tasks.task import (
-    CONTROL_TIMESTEP,
-    MOST_SUBSTEPS,
-    SUBSTEPS,
-    TERRAIN_LEVEL,
-    Task,
-)
-from trl_suite.tasks.terms import Outcome, conclude
+from trl_suite.tasks.rewards import Outcome, conclude
+from trl_suite.tasks.task import MOST_SUBSTEPS, SUBSTEPS, TERRAIN_LEVEL, Task
 from trl_suite.tasks.tracking import make_body
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.util.compiled import compiled, packed
