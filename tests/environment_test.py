@@ -1,17 +1,13 @@
 """Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
-import contextlib
 import gc
-import io
 import json
 import pathlib
 import pickle
-import tempfile
 import threading
 import weakref
 from unittest import mock
 
-import dm_env
 import golden
 import numpy as np
 import pytest
@@ -26,6 +22,7 @@ from helpers import (
     assert_refused,
     assert_rows_are_singles,
     links_on_ground,
+    made,
 )
 
 from trl_suite import characters, describe, motion, policies, rendering, suite, terrain
@@ -34,11 +31,9 @@ from trl_suite.environments.environment import Environment
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
-EXAMPLES = (
-    GAPS, 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
-    'Torque_Biped2D_LLC_Imitate_Flat-v0', 'Vel_Dog2D_LLC_Imitate_Flat-v0',
-    'FSM_Raptor2D_Terrain_Slopes-v0', 'PD_Biped3D_Imitate-Hills-v0',
-    'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_HLC_LargeBlocks-v0',
+EXAMPLES = (  # built, stepped and closed
+    GAPS, 'FSM_Raptor2D_Terrain_Slopes-v0', 'PD_Biped3D_LLC_General_Step-v0',
+    'PD_Biped3D_HLC_LargeBlocks-v0',
 )  # fmt: skip
 
 
@@ -57,11 +52,9 @@ def is_high(id_):
 ROOT = pathlib.Path(__file__).parents[1]
 STORED = json.loads((ROOT / 'tests/golden.json').read_text())
 
-# Steps of 1/30 s.
-ONE_BY_ONE = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
-
-FALLING = {*ONE_BY_ONE[::3], *filter(is_high, suite.ALL_IDS)}  # whose falls are looked at
-
+# Whose falls are looked at: every third whose steps last 1/30 s, and those whose steps are footsteps.
+SHORT = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
+FALLING = {*SHORT[::3], *filter(is_high, suite.ALL_IDS)}
 
 # What papers and documentation say of each environment, reviewed; see `row`.
 TABLE = {
@@ -96,83 +89,31 @@ def random_actions(environment, steps, seed=0):
     )
 
 
-def rollout(environment, actions, look=lambda: None):
-    """Flat arrays of what an environment returns: observations, rewards, discounts, types."""
-    steps = []
-    for action in (None, *actions):
-        steps.append(environment.reset() if action is None else environment.step(action))
-        look()
-    observations = [np.concatenate([np.ravel(v) for v in s.observation.values()]) for s in steps]
-    return (
-        np.array(observations),
-        np.array([np.nan if s.reward is None else s.reward for s in steps]),
-        np.array([np.nan if s.discount is None else s.discount for s in steps]),
-        [s.step_type for s in steps],
-    )
+def rollout(environment, actions):
+    """Observations, rewards, discounts and types of steps, as one array."""
+    steps = [environment.reset(), *map(environment.step, actions)]
+    return np.array([
+        [*np.concatenate([*step.observation.values()]), step.reward or 0.0,
+         np.nan if step.discount is None else step.discount, step.step_type]
+        for step in steps
+    ])  # fmt: skip
+
+
+def newly_seeded(id_, seed, step_limit=256, environment=None):
+    """An environment before its first reset, shared by the tests of an id."""
+    environment = environment or made(id_)
+    environment.random_state.seed(seed)
+    environment.step_limit = step_limit
+    return environment
 
 
 def every_environment(id_):
-    """Tests of one environment that apply to all, including those of dm_env.
-
-    It is built once for all tests, as building takes most of the time; seeding restores the state
-    of a new one.
-    """
+    """Tests of one environment that apply to all."""
     gait, high = is_gait(id_), is_high(id_)
 
-    class EveryEnvironment(test_utils.EnvironmentTestMixin, absltest.TestCase):
-        @classmethod
-        def setUpClass(cls):
-            super().setUpClass()
-            cls.kept = {}
-
-        @classmethod
-        def tearDownClass(cls):
-            super().tearDownClass()
-            cls.let_go()
-
-        @classmethod
-        def let_go(cls):
-            while cls.kept:
-                cls.kept.popitem()[1].close()
-
-        def made(self, seed, flat=False, step_limit=256):
-            """The environment, newly seeded, before its first reset."""
-            if flat not in self.kept:
-                self.kept[flat] = suite.make(id_, {'random': seed}, {'flat_observation': flat})
-            environment = self.kept[flat]
-            environment.random_state.seed(seed)
-            environment.step_limit = step_limit
-            return environment
-
-        # Renamed so that it runs first: then the environment is fresh.
-        test_a_step_on_fresh_environment = (
-            test_utils.EnvironmentTestMixin.test_step_on_fresh_environment
-        )
-        test_step_on_fresh_environment = None
-
-        def make_object_under_test(self):
-            if self._testMethodName == 'test_a_step_on_fresh_environment':
-                self.let_go()
-            return self.made(0, step_limit=2 if gait or high else 12)  # so that episodes end
-
-        def tearDown(self):
-            absltest.TestCase.tearDown(self)  # the mixin's closes the environment
-
-        def make_action(self):
-            # dm_env uses the minimum: with such an action, a cycle of a gait lasts until truncation.
-            return np.zeros(self.environment.action_spec().shape) if gait else super().make_action()
-
-        def make_action_sequence(self):
-            return random_actions(self.environment, 3 if gait or high else 30)
-
-        def test_action_spec_is_minus_1_to_1(self):
-            spec = self.environment.action_spec()
-            self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
-            self.assertEqual((spec.minimum.shape, spec.maximum.shape), (spec.shape,) * 2)
-            self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
-
+    class EveryEnvironment(absltest.TestCase):
         def test_it_is_as_reviewed(self):
-            environment, spec = self.made(0), suite.find(id_)
+            environment, spec = newly_seeded(id_, 0), suite.find(id_)
             environment.step_limit = spec.step_limit
             environment.reset()
             self.assertEqual(row(environment, spec), TABLE.get(id_))
@@ -189,43 +130,51 @@ def every_environment(id_):
                 self.assertEqual(shapes[name].shape, (part.stop - stop,))
                 self.assertEqual(shapes[name].dtype, np.float64)
                 stop = part.stop
+            actions = environment.action_spec()
+            self.assertLen(actions.name.split('\t'), actions.shape[0])
+            np.testing.assert_array_equal(actions.minimum, -np.ones(actions.shape))
+            np.testing.assert_array_equal(actions.maximum, np.ones(actions.shape))
             for name in (*spec.aliases, f'{spec.domain}/{spec.task}'):
                 self.assertIs(suite.find(name), spec)
             self.assertRegex(id_, r'^\w+(-\w+)?-v\d$')  # what Gymnasium takes for a name
             self.assertRegex(spec.description, r'^[A-Z].{,128}\.$')
             self.assertLen(spec.tags & {'original', 'completion', 'addition'}, 1)
 
-        def test_random_rollout_is_finite_with_rewards_in_0_to_1(self):
-            # A walker with random plans may not fall: its episode is truncated.
-            self.wander(*((6, 4) if gait else (16, 12) if high else (200, 256)))
+        def test_simulations_equal_single_environments_and_are_sound(self):
+            """With options: in state_test."""
+            limit, steps = (1, 4) if gait else (3, 8) if high else (25, 52)
+            scale = 0.3 if gait else np.array([[0.3], [1.0], [2.0]])
+            one = newly_seeded(id_, 0, limit)
+            found, ends = assert_rows_are_singles(
+                id_, 3, steps, limit, scale=scale, seed=5, one=one
+            )
+            self.assertGreaterEqual(ends, 6)
+            self.check(found)
 
         @pytest.mark.slow
-        def test_long_random_rollout_is_finite_with_rewards_in_0_to_1(self):
-            self.wander(300 if gait or high else 5000, 256)
+        def test_long_random_rollout(self):
+            environments = VectorEnvironment(id_, 2, 2, seed=1)
+            environments.reset()
+            draw, size = np.random.default_rng(1), len(environments.action_map)
+            steps = [environments.step(draw.uniform(-1, 1, (2, size)))
+                     for _ in range(200 if gait or high else 2500)]  # fmt: skip
+            self.check(steps)
+            self.assertTrue(any(step.terminated.any() or step.truncated.any() for step in steps))
 
-        def wander(self, steps, step_limit):
-            environment = self.made(1, step_limit=step_limit)
-            terms = []  # they sum to the reward, and are 0 after a reset
-            observations, rewards, discounts, types = rollout(
-                environment, random_actions(environment, steps),
-                lambda: terms.append(sum(environment.info['reward_terms'].values())),
-            )  # fmt: skip
-            np.testing.assert_allclose(terms, np.nan_to_num(rewards), rtol=0, atol=1e-12)
-            self.assertTrue(np.isfinite(observations).all())
-            self.assertLess(np.abs(observations).max(), 1e4)
-            first = np.array([each is dm_env.StepType.FIRST for each in types])
-            self.assertTrue(np.isfinite(rewards[~first]).all())
-            self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
-            self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
-            last = np.array([each is dm_env.StepType.LAST for each in types])
-            self.assertTrue(last.any())  # by a fall, or truncated
-            np.testing.assert_array_equal(rewards[discounts == 0], 0)
-            np.testing.assert_array_equal(last[discounts == 0], True)
+        def check(self, steps):
+            """Numbers are finite; rewards are in [0, 1], the sum of their terms, and 0 at a fall."""
+            for step in steps:
+                self.assertTrue(np.isfinite(step.observation).all())
+                self.assertLess(np.abs(step.observation).max(), 1e4)
+                self.assertTrue(((step.reward >= 0) & (step.reward <= 1)).all())
+                terms = sum(step.info['reward_terms'].values())
+                np.testing.assert_allclose(terms, step.reward, rtol=0, atol=1e-12)
+                np.testing.assert_array_equal(step.reward[step.terminated], 0)
 
         if id_ in FALLING:
 
             def test_a_fall_is_a_failure(self):
-                environment = self.made(5)
+                environment = newly_seeded(id_, 5)
                 environment.reset()
                 fall_links = set(environment.task.character.spec.fall_links)
                 for action in random_actions(environment, 250, seed=1):
@@ -245,23 +194,11 @@ def every_environment(id_):
                 self.assertTrue(step.first())
                 self.assertFalse(environment.info['fell'])
 
-        def test_flat_observation_is_the_concatenated_blocks(self):
-            blocks, flat = self.made(2), self.made(2, flat=True)
-            actions = random_actions(blocks, 1 if gait else 3 if high else 20)
-            for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
-                np.testing.assert_array_equal(ours, theirs)
-
-        def test_simulations_of_a_vector_environment_equal_single_ones(self):
-            # With options: in state_test.
-            limit, steps = (1, 4) if gait else (3, 8) if high else (12, 30)
-            scale, one = 0.3 if gait else 1.0, self.made(0, flat=True, step_limit=limit)
-            _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5, one=one)
-            self.assertGreaterEqual(ends, 6)
-
         def test_first_steps_equal_the_stored_ones(self):
             stored = dict(STORED[id_])
-            made = None if high else self.made(0)  # planners of the record have another controller
-            found = golden.summary(id_, stored.pop('seed'), environment=made)
+            # Planners of the record have another controller.
+            environment = None if high else newly_seeded(id_, 0)
+            found = golden.summary(id_, stored.pop('seed'), environment=environment)
             self.assertCountEqual(found, stored)
             for name, expected in stored.items():
                 tolerance = golden.TOLERANCE
@@ -270,7 +207,7 @@ def every_environment(id_):
                 )
 
         def test_the_description_is_complete(self):
-            sections = describe.sections(suite.find(id_), self.environment)
+            sections = describe.sections(suite.find(id_), newly_seeded(id_, 0))
             found = ''.join(f'\n{title}\n{text}' for title, text in sections)
             self.assertNotRegex(found, r'\bnan\b|\binf\b|None|<')
             for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
@@ -289,31 +226,62 @@ def every_environment(id_):
         if id_ in policies.available():
 
             def test_the_shipped_policy_fits(self):
-                environment, policy = self.made(0), policies.reference(id_)
+                environment, policy = newly_seeded(id_, 0), policies.reference(id_)
                 policy.check(environment)
                 action = policy(environment.reset().observation)
                 self.assertEqual(action.shape, environment.action_spec().shape)
                 self.assertTrue(np.isfinite(action).all())
 
-        if id_ in KINDS:  # with options: in state_test
+    return EveryEnvironment
 
-            def test_a_restored_state_continues_exactly(self):
-                steps = 1 if gait else 2 if high else 5
 
-                def go(environment, seed):
-                    return advance(environment, seed, steps, 0.3)
+def every_kind(id_):
+    """Tests of dm_env, and others, of one environment of each kind."""
+    gait, high = is_gait(id_), is_high(id_)
 
-                environment, other = self.made(6), suite.make(id_, {'random': 9})
-                for each in (environment, other):
-                    each.reset()
-                    go(each, 0)
-                assert_goes_on(environment, other, go)
+    class Kind(test_utils.EnvironmentTestMixin, absltest.TestCase):
+        def make_object_under_test(self):
+            fresh = self._testMethodName == 'test_step_on_fresh_environment'
+            environment = suite.make(id_) if fresh else None
+            return newly_seeded(id_, 0, 2 if gait or high else 12, environment)  # episodes end
+
+        def tearDown(self):
+            absltest.TestCase.tearDown(self)  # the mixin's closes the environment
+
+        def make_action(self):
+            # dm_env uses the minimum: with such an action, a cycle of a gait lasts until truncation.
+            return np.zeros(self.environment.action_spec().shape) if gait else super().make_action()
+
+        def make_action_sequence(self):
+            return random_actions(self.environment, 3 if gait or high else 30)
+
+        def test_a_restored_state_continues_exactly(self):
+            """With options: in state_test."""
+            steps = 1 if gait else 2 if high else 5
+
+            def go(environment, seed):
+                return advance(environment, steps, seed, 0.3)
+
+            environment = newly_seeded(id_, 6, 256, self.environment)
+            other = suite.make(id_, {'random': 9})
+            for each in (environment, other):
+                each.reset()
+                go(each, 0)
+            assert_goes_on(environment, other, go)
+
+        def test_far_actions_are_clipped(self):
+            environment, found = self.environment, []
+            for size in (1.0, 5.0, 1e200):
+                environment.random_state.seed(4)
+                found.append(rollout(environment, size * np.sign(random_actions(environment, 1))))
+            np.testing.assert_array_equal(found[0], found[1])
+            np.testing.assert_array_equal(found[0], found[2])
 
         # Gaits and planners step their physics in the task: see gait_test, and below.
-        if not gait and not high and id_ in KINDS:
+        if not gait and not high:
 
             def test_plain_composer_environment_agrees(self):
-                ours = self.made(3)
+                ours = newly_seeded(id_, 3, 256, self.environment)
                 theirs = composer.Environment(
                     suite.build_task(suite.find(id_)), random_state=3,
                     strip_singleton_obs_buffer_dim=True,
@@ -321,15 +289,17 @@ def every_environment(id_):
                 np.testing.assert_array_equal(theirs.action_spec().minimum, -1)
                 np.testing.assert_array_equal(theirs.action_spec().maximum, 1)
                 actions = random_actions(ours, 40)
-                for mine, composers in zip(
-                    rollout(ours, actions), rollout(theirs, actions), strict=True
-                ):
-                    np.testing.assert_array_equal(mine, composers)
+                np.testing.assert_array_equal(rollout(ours, actions), rollout(theirs, actions))
 
-    EveryEnvironment.__name__ = EveryEnvironment.__qualname__ = f'EveryEnvironment_{id_}'.replace(
-        '-', '_'
-    )
-    return EveryEnvironment
+    return Kind
+
+
+for _ids, _make in (suite.ALL_IDS, every_environment), (KINDS, every_kind):
+    for _id in _ids:
+        _class = _make(_id)
+        _class.__name__ = _class.__qualname__ = f'{_class.__name__}_{_id}'.replace('-', '_')
+        globals()[_class.__name__] = _class
+del _class  # else it would be collected twice
 
 
 class PlainComposerTest(parameterized.TestCase):
@@ -351,37 +321,21 @@ class PlainComposerTest(parameterized.TestCase):
         with self.assertRaisesRegex(RuntimeError, message):
             environment.step(np.zeros(len(task.action_map)))
 
-    @parameterized.product(
-        id_=('PD_Biped2D_Flat_Terrain-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'PD_Biped3D_HLC_Soccer-v0'),
-        size=(0, 1, 10**6),
-    )  # fmt: skip
-    def test_actions_of_other_shapes_are_rejected(self, id_, size):
+    @parameterized.parameters(
+        'PD_Biped2D_Flat_Terrain-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'PD_Biped3D_HLC_Soccer-v0'
+    )
+    def test_actions_of_other_shapes_are_rejected(self, id_):
         environment = composer.Environment(suite.build_task(suite.find(id_)), random_state=0)
         environment.reset()
-        with self.assertRaisesRegex(ValueError, rf'action has shape \({size},\); expected'):
-            environment.step(np.zeros(size))
+        for size in (0, 1, 10**6):
+            with self.assertRaisesRegex(ValueError, rf'action has shape \({size},\); expected'):
+                environment.step(np.zeros(size))
 
 
 class GoldenTest(absltest.TestCase):
     def test_all_environments_are_stored(self):
         self.assertCountEqual(STORED, suite.ALL_IDS)
         self.assertEqual([*TABLE], list(suite.ALL_IDS))
-
-    def test_a_check_tells_what_differs(self):
-        id_ = 'PD_Dog2D_Flat-v0'
-        path = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()), 'stored.json')
-        for reward, differs in ((0.0, ''), (0.5, f'{id_}\n    reward: by 5.0e-01 in step 0\n')):
-            stored = {**STORED[id_], 'reward': [reward, *STORED[id_]['reward'][1:]]}
-            path.write_text(json.dumps({id_: stored}))
-            with contextlib.redirect_stdout(io.StringIO()) as printed:
-                self.assertEqual(golden.check(path, ''), not differs)
-            self.assertIn(f'MuJoCo lacks: nothing\n{differs}', printed.getvalue())
-
-
-for _id in suite.ALL_IDS:
-    _class = every_environment(_id)
-    globals()[_class.__name__] = _class
-del _class  # else it would be collected twice
 
 
 class ActionTest(parameterized.TestCase):
@@ -406,17 +360,6 @@ class ActionTest(parameterized.TestCase):
         self.assertEqual(pickle.dumps(environment.get_state()), before)
         self.assertTrue(environment.step(np.zeros(11)).mid())
 
-    @parameterized.parameters(*EXAMPLES)
-    def test_far_actions_are_clipped(self, id_):
-        environment, poses = suite.make(id_), []
-        for size in (1.0, 5.0, 1e200):
-            environment.random_state.seed(4)
-            environment.reset()
-            action = size * np.sign(random_actions(environment, 1)[0])
-            poses.append(environment.step(action).observation['pose'])
-        np.testing.assert_array_equal(poses[0], poses[1])
-        np.testing.assert_array_equal(poses[0], poses[2])
-
     def test_the_given_action_is_not_changed(self):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
@@ -426,78 +369,19 @@ class ActionTest(parameterized.TestCase):
         environment.step(list(action))
 
 
-def held(**options):
-    """A biped held in the air so that it never falls."""
-    environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 0, **options})
-    environment.reset()
-    return environment
-
-
-def lift(environment):
-    data = environment.physics.named.data
-    data.qpos['biped2d/root_z/'] = 5.0
-    data.qvel['biped2d/root_z/'] = 0.0
-    data.qpos['biped2d/root_pitch/'] = 0.0
-    environment.physics.forward()
-
-
-class EpisodeTest(parameterized.TestCase):
-    """How episodes end and begin."""
-
-    def length(self, environment):
-        for i in range(1, 1000):
-            lift(environment)
-            step = environment.step(np.zeros(6))
-            if step.last():
-                return i, step
-        return None
-
-    @parameterized.parameters(
-        ({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.1}, 3), ({'time_limit': 0.5}, 15),
-        ({'time_limit': 1}, 30), ({'time_limit': 4.0}, 120), ({'time_limit': 0.11}, 4),
-    )  # fmt: skip
-    def test_truncation_is_not_a_failure(self, options, steps):
-        environment = held(**options)
-        count, step = self.length(environment)
-        self.assertEqual(count, steps)
-        self.assertEqual(step.discount, 1.0)
-        self.assertGreater(step.reward, 0)
-        self.assertFalse(environment.info['fell'])
-        self.assertTrue(environment.step(np.zeros(6)).first())
-        self.assertEqual(self.length(environment)[0], steps)
-
-    def test_no_limit(self):
-        environment = held(step_limit=None)
-        for _ in range(300):
-            lift(environment)
-            self.assertTrue(environment.step(np.zeros(6)).mid())
-
-    def test_distance(self):
-        environment = held()
-        for _ in range(5):
-            environment.step(np.zeros(6))
-        x = environment.physics.named.data.qpos['biped2d/root_x/'][0]
-        self.assertEqual(environment.info['distance'], x)
-        self.assertNotEqual(x, 0)
-
-
 class ObservableTest(parameterized.TestCase):
     """A user's own observables in addition to the blocks."""
 
-    def build(self, **options):
-        spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
-        task = suite.build_task(spec)
+    def build(self):
+        task = suite.build_task(suite.find('PD_Dog2D_Gaps_Terrain-v0'))
         character = task.character
+        places = observable.Generic(lambda physics: physics.bind(character.bodies).xipos)
         for name, each in (
             ('joints_pos', observable.MJCFFeature('qpos', character.joints)),
-            (
-                'bodies_pos',
-                observable.Generic(lambda physics: physics.bind(character.bodies).xipos),
-            ),
-            ('root_pos', observable.MJCFFeature('xpos', character.root_body)),
-        ):
+            ('bodies_pos', places), ('root_pos', observable.MJCFFeature('xpos', character.root_body)),
+        ):  # fmt: skip
             character.observables.add_observable(name, each)
-        return Environment(task, random=7, **options)
+        return Environment(task, random=7)
 
     def test_observables_are_current(self):
         environment = self.build()
@@ -507,7 +391,7 @@ class ObservableTest(parameterized.TestCase):
         self.assertEqual(spec['dog/bodies_pos'].shape, (21, 3))
         names = [f'dog/{name}' for name in characters.CHARACTERS['dog'].joints]
         step = environment.reset()
-        for action in random_actions(environment, 60):
+        for action in random_actions(environment, 15):
             qpos = environment.physics.named.data.qpos
             found = np.array([qpos[name][0] for name in names])
             np.testing.assert_array_equal(step.observation['dog/joints_pos'], found)
@@ -527,6 +411,8 @@ class ObservableTest(parameterized.TestCase):
             np.testing.assert_array_equal(value, copies[name])
             value[:] = 77.0  # must not reach into the environment
         self.assertTrue((np.abs(environment.step(np.zeros(11)).observation['pose']) < 50).all())
+        x = environment.physics.named.data.qpos['biped2d_full/root_x/'][0]
+        self.assertEqual(environment.info['distance'], x)
 
 
 class HookTest(parameterized.TestCase):
@@ -617,15 +503,15 @@ class ConstructionTest(parameterized.TestCase):
         state = environment.get_state()
         environment.close()
         environment.close()
-        for call in (
+        calls = (
             lambda: environment.step(np.zeros(11)), environment.reset, environment.get_state,
             lambda: environment.set_state(state), environment.observation,
             environment.observation_spec, lambda: environment.info, lambda: environment.physics,
-            lambda: environment.add_extra_hook('before_step', print),
-            lambda: rendering.frame(environment), lambda: pickle.dumps(environment),
-        ):  # fmt: skip
-            with self.assertRaisesRegex(RuntimeError, 'the environment is closed'):
-                call()
+            lambda: environment.add_extra_hook('before_step', print), lambda: environment.task,
+            lambda: rendering.frame(environment), lambda: pickle.dumps(environment), environment.action_spec,
+        )  # fmt: skip
+        cases = ((call, 'the environment is closed') for call in calls)
+        assert_refused(self, *cases, error=RuntimeError)
 
     @parameterized.parameters(*EXAMPLES)
     def test_close_frees_the_simulation(self, id_):
@@ -638,9 +524,6 @@ class ConstructionTest(parameterized.TestCase):
         mjcf.Physics.from_xml_string('<mujoco/>')  # dm_control keeps the last model it parsed
         gc.collect()
         self.assertEqual([each() for each in freed], [None, None])
-        for look in (lambda: environment.task, lambda: environment.info, environment.action_spec):
-            with self.assertRaisesRegex(RuntimeError, 'closed'):
-                look()
 
 
 class ThreadsTest(parameterized.TestCase):
@@ -689,7 +572,3 @@ class ThreadsTest(parameterized.TestCase):
             environments.get_state, lambda: environments.set_state(state), environments.close,
             lambda: environments.copy_from(environments, [0], [1]), lambda: environments.seed(3),
         ))  # fmt: skip
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -187,8 +187,8 @@ def assert_rows_are_singles(
 ):
     """Checks that simulations equal single environments with their seeds, bit for bit.
 
-    One single environment plays the simulations, one after the other: building many would take most of the
-    time, and what it did before must not matter either.
+    One single environment plays the simulations, one after the other: building many would take most
+    of the time, and what it did before must not matter either. Flat observations are the blocks.
 
     Args:
       spec: id or specification of the environment.
@@ -199,7 +199,7 @@ def assert_rows_are_singles(
       scale: scale of the random actions, a number or one for each simulation, (n, 1).
       seed: seed of the simulations.
       num_threads: number of threads.
-      one: the single environment, with flat observations; None to make one.
+      one: the single environment; None to make one.
 
     Returns:
       What the simulations returned, a list of `Step`, and how many episodes ended.
@@ -215,16 +215,16 @@ def assert_rows_are_singles(
     for action in actions:
         found.append(environments.step(action))
     if one is None:
-        one = build(spec, {'step_limit': step_limit, **options}, flat=True)
+        one = build(spec, {'step_limit': step_limit, **options})
     ends = 0
     for env_id, own in enumerate(environments.seeds.tolist()):
         one.random_state.seed(own)
         where = f'{id_}, simulation {env_id}'
-        expected = one.reset().observation['observations']
+        expected = np.concatenate([*one.reset().observation.values()])
         np.testing.assert_array_equal(first[env_id], expected, f'{where}, reset')
         for i, (step, action) in enumerate(zip(found, actions, strict=True)):
             time_step, where = one.step(action[env_id]), f'{id_}, simulation {env_id}, step {i}'
-            expected = time_step.observation['observations']
+            expected = np.concatenate([*time_step.observation.values()])
             np.testing.assert_array_equal(step.observation[env_id], expected, where)
             last, cut = time_step.last(), time_step.discount == 1
             ours = step.reward[env_id], step.terminated[env_id], step.truncated[env_id]
@@ -245,7 +245,7 @@ def _assert_same_info(of_rows, of_one, env_id, where):
             np.testing.assert_array_equal(of_rows[name][env_id], value, f'{where}, {name}')
 
 
-def advance(environment, seed, steps, scale, look=lambda environment: ()):
+def advance(environment, steps, seed=0, scale=1.0, look=lambda environment: ()):
     """Takes random actions; returns all results and probed values as one array."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(steps):
