@@ -1,10 +1,11 @@
 """Tests of muscles: the tables, the Hill formulas, and MuJoCo's muscles held against them."""
 
+import functools
 import math
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import composer, mjcf
 
 from trl_suite import actuation, characters, suite
@@ -121,19 +122,29 @@ def fibre_velocity(force_velocity):
     return np.where(f < 1, shortening, lengthening)
 
 
+@functools.cache
+def physics_of(name):
+    """A character with muscles, its root welded."""
+    arena = composer.Arena()
+    option = arena.mjcf_model.option
+    option.timestep, option.gravity = TIMESTEP, (0, 0, 0)
+    option.flag.contact = 'disable'
+    character = characters.make(name)
+    arena.attach(character)
+    actuation.add(character, 'muscle', TIMESTEP)
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    # What the other muscles do must not reach the limits of joints.
+    physics.model.ptr.jnt_actfrclimited[:] = 0
+    return physics
+
+
 class Rig:
-    """A character with muscles, its root welded; one muscle and the joints under it."""
+    """One muscle of a character and the joints under it."""
 
     def __init__(self, name, muscle):
-        arena = composer.Arena()
-        option = arena.mjcf_model.option
-        option.timestep, option.gravity = TIMESTEP, (0, 0, 0)
-        option.flag.contact = 'disable'
-        character = characters.make(name)
-        arena.attach(character)
-        actuation.add(character, 'muscle', TIMESTEP)
-        self._physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-        self.model, self.data = self._physics.model.ptr, self._physics.data.ptr
+        physics = physics_of(name)
+        mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
+        self.model, self.data = physics.model.ptr, physics.data.ptr
         self.l_opt, _, self.f_max, self.pennation, self.arms = SAMPLES[name][muscle]
         self.prefix = f'{name}/'
         self.muscle = self.data.actuator(self.prefix + muscle)
@@ -218,16 +229,10 @@ class MujocoTest(parameterized.TestCase):
     """The compiled muscles, pulling on real joints."""
 
     @parameterized.parameters(*CASES)
-    def test_peak_force_at_optimal_length(self, name, muscle):
-        rig = Rig(name, muscle)
-        self.assertAlmostEqual(rig.force(1), 1, delta=1e-9)
-        self.assertAlmostEqual(rig.force(0.01), 0.01, delta=1e-9)
-        self.assertAlmostEqual(rig.force(0.5), 0.5, delta=1e-9)  # activation without a lag
-
-    @parameterized.parameters(*CASES)
-    def test_moment_arms(self, name, muscle):
-        rig = Rig(name, muscle)
-        rig.force(1)
+    def test_forces_and_moment_arms(self, name, muscle):
+        rig, lengths = Rig(name, muscle), np.linspace(0.3, 1.8, 31)
+        for excitation in (1, 0.01, 0.5):  # activation without a lag
+            self.assertAlmostEqual(rig.force(excitation), excitation, delta=1e-9)
         rest = rig.muscle.length[0]
         for joint, arm in rig.arms.items():
             rig.rest()
@@ -236,6 +241,11 @@ class MujocoTest(parameterized.TestCase):
             self.assertAlmostEqual(
                 (rig.muscle.length[0] - rest) / 0.1, -arm_at_rest(*arm), delta=1e-9, msg=joint
             )
+        found = []
+        for length in lengths:
+            rig.stretch(length)
+            found.append(rig.active())
+        np.testing.assert_allclose(found, force_length(lengths), atol=ISOMETRIC_ERROR)
 
     @parameterized.parameters(
         ('biped2d', 'right_GLU', 'right_hip', -0.094 * 1500),  # an extensor of 141 N m
@@ -248,23 +258,11 @@ class MujocoTest(parameterized.TestCase):
         ('raptor', 'tail1_bot', 'tail1', 0.04 * math.cos(0.1) * 2000),
     )  # fmt: skip
     def test_torque(self, name, muscle, joint, torque):
-        rig = Rig(name, muscle)
-        for other in rig.arms:  # what the other muscles do must not reach the joint's limit
-            rig.model.jnt_actfrclimited[rig.model.joint(rig.prefix + other).id] = 0
-        torques = []
+        rig, torques = Rig(name, muscle), []
         for excitation in (1, 0.01):
             rig.force(excitation)
             torques.append(float(rig.joint(joint).qfrc_actuator[0]))
         self.assertAlmostEqual((torques[0] - torques[1]) / 0.99, torque, delta=1e-6)
-
-    @parameterized.parameters(*CASES)
-    def test_force_length(self, name, muscle):
-        rig, lengths = Rig(name, muscle), np.linspace(0.3, 1.8, 31)
-        found = []
-        for length in lengths:
-            rig.stretch(length)
-            found.append(rig.active())
-        np.testing.assert_allclose(found, force_length(lengths), atol=ISOMETRIC_ERROR)
 
     def test_passive_force(self):
         rig, lengths = Rig('biped2d', 'right_GLU'), np.linspace(0.3, 1.8, 31)
@@ -337,7 +335,3 @@ class StrainTest(parameterized.TestCase):
         self.assertEqual(ctrl['biped2d/left_SOL'], 1.0)
         self.assertAlmostEqual(ctrl['biped2d/right_SOL'], 0.01)
         self.assertLess(force['biped2d/left_SOL'], 10 * force['biped2d/right_SOL'])
-
-
-if __name__ == '__main__':
-    absltest.main()
