@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import FolderTest
+from helpers import FolderTest, assert_refused
 from scipy.spatial.transform import Rotation
 
 from trl_suite import motion, retargeting, suite
@@ -18,9 +18,8 @@ from trl_suite.motion import quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.retargeting import clip_check
 
-FILE_AXES = np.array(
-    [[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]
-)  # to the suite's frame, from y up, z forward
+# From y up, z forward to the suite's frame.
+FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
 
@@ -153,6 +152,46 @@ def write_acclaim(figure, skeleton, path, length=0.45):
     path.write_text('\n'.join(lines) + '\n')
 
 
+UNUSABLE = (  # name and content of a file, message, content of a skeleton
+    ('a.bvh', 'HIERARCHY\n', r'a\.bvh: ', None), ('a.bvh', '', r'a\.bvh: is empty; expected one of: BVH', None),
+    ('a.bvh', '<xml/>', r'a\.bvh: not a motion file', None), ('a.json', '{', r'a\.json: not JSON', None),
+    ('a.json', '{"Loop": true', r'a\.json: .*not JSON', None),
+    ('a.json', f'{{"Loop": {5000 * "9"}}}', r'a\.json: .*not JSON: .*4300', None),
+    ('a.json', f'{{"Frames": {2000 * "["}{2000 * "]"}}}', 'nested too deeply', None),
+    ('a.amc', '1\nroot 1\n', 'needs its skeleton, an .asf file', None),
+    ('a.amc', '1\n', r"a\.asf, line 2: 'order TX': expected TX, TY and TZ", ':root\norder TX\n'),
+    ('a.amc', '1\n', "a.asf, line 4: 'length", ':bonedata\nbegin\nname x\nlength far\nend\n'),
+    ('a.bvh', 'HIERARCHY\n', r'a skeleton \(.*a\.asf\) was given', ':root\n'),
+    ('a.asf', ':root\n', r'a skeleton \(.asf\); expected the motion', None),
+)  # fmt: skip
+DAMAGED = (  # the last of these words in a file, what takes its place, the message
+    ('a.bvh', 'OFFSET 0.000000', 'OFFSET nan', "'OFFSET nan .*'; expected OFFSET and three finite"),
+    ('a.bvh', 'Frame Time: ', 'Frame Time: inf ', 'Frame Time is inf; expected a positive'),
+    ('a.bvh', 'CHANNELS 3 Zrotation Xrotation Yrotation', 'CHANNELS 0', 'without channels are not'),
+    ('a.bvh', 'MOTION', 'MOTON', 'no line MOTION'), ('a.bvh', 'Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
+    ('a.bvh', 'Frame Time: ', 'Frame Time: 1e-320 ', 'too large, or Frame Time is too small'),
+    ('a.asf', 'begin\nid 2', 'id 2', "'id 2': expected 'begin' before it"),
+    ('a.asf', 'length 0.45', 'length 0', "'length 0': expected a positive number"),
+    ('a.asf', 'length 0.45', 'length nan', "'length nan': expected a positive number"),
+    ('a.asf', 'direction 0 -1 0', 'direction 0 inf 0', 'expected three finite numbers'),
+    ('a.asf', 'direction 0 -1 0', 'direction', 'expected three finite numbers'),
+    ('a.asf', 'direction 0 -1 0\n', '', "'end': the bone has no direction"),
+    ('a.asf', 'XYZ\ndof', 'XYX\ndof', 'expected an order of axes, such as XYZ'),
+    ('a.asf', 'dof rx ry rz', 'dof rx rw rz', "unknown degree of freedom 'rw'; known: l, rx"),
+    ('a.asf', 'dof rx ry rz', 'dof rx rx rz', 'given twice'), ('a.asf', 'name thorax', 'name root', "'name root': the name is taken"),
+    ('a.asf', '\nend\n', '\nthorax to_thorax\nend\n', "'to_thorax' has a parent already"),
+    ('a.asf', '\nend\n', '\nthorax tooth\nend\n', "unknown bone 'tooth'"),
+    ('a.asf', 'root to_thorax', 'thorax to_thorax', "'thorax to_thorax': a bone whose parent is"),
+    ('a.asf', '\nend\n', '\nthorax root\nend\n', "'root' has a parent already"),
+    ('a.amc', '\n1\n', '\n', 'line 4: .*expected the number of a frame'),
+    ('a.amc', 'thorax', 'throax', "unknown bone 'throax'; did you mean"),
+    ('a.amc', 'root ', 'root nan ', r'line \d+: .*7 numbers; expected 6'),
+    ('a.amc', 'root -?[0-9.]+', 'root nan', r'line \d+: .*expected finite numbers'),
+    ('a.amc', 'root ', 'rfoot ', r'line \d+: .*6 numbers; expected 3'), ('a.amc', '(.|\n)+', '', '0 frames; expected at least 2'),
+    *((name, 'o', '\xff', 'not text in UTF-8') for name in ('a.bvh', 'a.asf', 'a.amc')),
+)  # fmt: skip
+
+
 class ClipTest(FolderTest):
     def assert_same_poses(self, clip, expected, places=1e-5):
         """Also the same rotations, of which quaternions have two."""
@@ -251,90 +290,30 @@ class ReadingTest(ClipTest):
             found = retargeting.read(self.folder / 'walk.txt', 'biped2d')
             np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
 
-    @parameterized.parameters(
-        ('a.bvh', 'HIERARCHY\n', r'a\.bvh: '),
-        ('a.bvh', '', r'a\.bvh: is empty; expected one of: BVH'),
-        ('a.bvh', '<xml/>', r'a\.bvh: not a motion file'),
-        ('a.json', '{', r'a\.json: not JSON'),
-        ('a.json', '{"Loop": true', r'a\.json: .*not JSON'),
-        ('a.json', '{"Loop": ' + 5000 * '9' + '}', r'a\.json: .*not JSON: .*4300'),
-        ('a.json', '{"Frames": ' + 2000 * '[' + 2000 * ']' + '}', 'nested too deeply'),
-        ('a.amc', '1\nroot 1\n', 'needs its skeleton, an .asf file'),
-        (
-            'a.amc',
-            '1\n',
-            r"a\.asf, line 2: 'order TX': expected TX, TY and TZ",
-            ':root\norder TX\n',
-        ),
-        ('a.amc', '1\n', "a.asf, line 4: 'length", ':bonedata\nbegin\nname x\nlength far\nend\n'),
-        ('a.bvh', 'HIERARCHY\n', r'a skeleton \(.*a\.asf\) was given', ':root\n'),
-        ('a.asf', ':root\n', r'a skeleton \(.asf\); expected the motion'),
-        ('none.bvh', None, "did you mean 'note.bvh'"),
-    )
-    def test_unusable_files(self, name, text, message, skeleton=None):
-        (self.folder / (name if text is not None else 'note.bvh')).write_text(text or '')
-        if skeleton is not None:
-            (self.folder / 'a.asf').write_text(skeleton)
-            skeleton = self.folder / 'a.asf'
-        with self.assertRaisesRegex((ValueError, FileNotFoundError), message):
-            retargeting.read(self.folder / name, PLAIN, skeleton)
+    def test_refused(self):
+        (self.folder / 'note.bvh').touch()
+        missing = lambda: retargeting.read(self.folder / 'none.bvh', PLAIN)  # noqa: E731
+        assert_refused(self, (missing, "did you mean 'note.bvh'"), error=FileNotFoundError)
+        for name, text, message, skeleton in UNUSABLE:
+            asf = self.folder / 'a.asf' if skeleton else None
+            (self.folder / 'a.asf').write_text(skeleton or '')
+            (self.folder / name).write_text(text)
+            read = lambda name=name, asf=asf: retargeting.read(self.folder / name, PLAIN, asf)  # noqa: E731
+            assert_refused(self, (read, message))
 
-    @parameterized.parameters(
-        # The last of these words in a file, what takes its place, the message.
-        (
-            'a.bvh',
-            'OFFSET 0.000000',
-            'OFFSET nan',
-            "'OFFSET nan .*'; expected OFFSET and three finite",
-        ),
-        ('a.bvh', 'Frame Time: ', 'Frame Time: inf ', 'Frame Time is inf; expected a positive'),
-        (
-            'a.bvh',
-            'CHANNELS 3 Zrotation Xrotation Yrotation',
-            'CHANNELS 0',
-            'without channels are not',
-        ),
-        ('a.bvh', 'MOTION', 'MOTON', 'no line MOTION'),
-        ('a.bvh', 'Frame Time: ', 'Frame Time: 1e-320 ', 'too large, or Frame Time is too small'),
-        ('a.bvh', 'Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
-        ('a.asf', 'begin\nid 2', 'id 2', "'id 2': expected 'begin' before it"),
-        ('a.asf', 'length 0.45', 'length 0', "'length 0': expected a positive number"),
-        ('a.asf', 'length 0.45', 'length nan', "'length nan': expected a positive number"),
-        ('a.asf', 'direction 0 -1 0', 'direction 0 inf 0', 'expected three finite numbers'),
-        ('a.asf', 'direction 0 -1 0', 'direction', 'expected three finite numbers'),
-        ('a.asf', 'direction 0 -1 0\n', '', "'end': the bone has no direction"),
-        ('a.asf', 'XYZ\ndof', 'XYX\ndof', 'expected an order of axes, such as XYZ'),
-        ('a.asf', 'dof rx ry rz', 'dof rx rw rz', "unknown degree of freedom 'rw'; known: l, rx"),
-        ('a.asf', 'dof rx ry rz', 'dof rx rx rz', 'given twice'),
-        ('a.asf', 'name thorax', 'name root', "'name root': the name is taken"),
-        ('a.asf', '\nend\n', '\nthorax to_thorax\nend\n', "'to_thorax' has a parent already"),
-        ('a.asf', '\nend\n', '\nthorax tooth\nend\n', "unknown bone 'tooth'"),
-        (
-            'a.asf',
-            'root to_thorax',
-            'thorax to_thorax',
-            "'thorax to_thorax': a bone whose parent is",
-        ),
-        ('a.asf', '\nend\n', '\nthorax root\nend\n', "'root' has a parent already"),
-        ('a.amc', '\n1\n', '\n', 'line 4: .*expected the number of a frame'),
-        ('a.amc', 'thorax', 'throax', "unknown bone 'throax'; did you mean"),
-        ('a.amc', 'root ', 'root nan ', r'line \d+: .*7 numbers; expected 6'),
-        ('a.amc', 'root -?[0-9.]+', 'root nan', r'line \d+: .*expected finite numbers'),
-        ('a.amc', 'root ', 'rfoot ', r'line \d+: .*6 numbers; expected 3'),
-        ('a.amc', '(.|\n)+', '', '0 frames; expected at least 2'),
-        *((name, 'o', '\xff', 'not text in UTF-8') for name in ('a.bvh', 'a.asf', 'a.amc')),
-    )
-    def test_damaged_files(self, name, before, after, message):
+    def test_damaged_files(self):
         paths = {path.name: path for path in self.capture()}
-        text = paths[name].read_text()
-        found = [*re.finditer(before, text)][-1]
-        changed = text[: found.start()] + after + text[found.end() :]
-        paths[name].write_bytes(changed.encode('latin-1'))
-        with self.assertRaisesRegex(ValueError, rf'{re.escape(name)}.*{message}'):
+        whole = {name: path.read_text() for name, path in paths.items()}
+        for name, before, after, message in DAMAGED:
+            found = [*re.finditer(before, whole[name])][-1]
+            changed = whole[name][: found.start()] + after + whole[name][found.end() :]
+            paths[name].write_bytes(changed.encode('latin-1'))
             if name == 'a.bvh':
-                retargeting.read(paths[name], PLAIN)
+                read = lambda: retargeting.read(paths['a.bvh'], PLAIN)  # noqa: E731
             else:
-                motion.read_amc(paths['a.amc'], paths['a.asf'])
+                read = lambda: motion.read_amc(paths['a.amc'], paths['a.asf'])  # noqa: E731
+            assert_refused(self, (read, rf'{re.escape(name)}.*{message}'))
+            paths[name].write_text(whole[name])
 
     @parameterized.parameters(motion.HUMANOID3D, motion.DOG3D)
     def test_deepmimics_layouts(self, **layout):
@@ -345,6 +324,9 @@ class ReadingTest(ClipTest):
         path.write_text(json.dumps({'Loop': 'wrap', 'Frames': [frame, frame]}))
         found = retargeting.read(path, PLAIN)
         self.assertEqual((found.joints, found.sizes), (tuple(layout), tuple(layout.values())))
+        self.assertEqual(
+            (len(frame), found.loop), (44 if layout == motion.HUMANOID3D else 84, True)
+        )
         path.write_text(json.dumps({'Loop': 'wrap', 'Frames': [frame[:-1]] * 2}))
         with self.assertRaisesRegex(ValueError, r'frame 0 has \d+ numbers; .* 44 .* or 84 \('):
             retargeting.read(path, PLAIN)
@@ -442,23 +424,20 @@ class CheckTest(parameterized.TestCase):
         poses[frames, column] += amount
         return dataclasses.replace(clip, poses=poses)
 
-    @parameterized.parameters(
-        (lambda walk: clip_check.check(walk, 'raptor'), "'biped2d_walk'.*does not fit 'raptor'"),
-        (lambda walk: retargeting.retarget(walk, 'raptor', {'root': 'root', 'left_nee': 'left_knee'}),
-         "unknown joint of the character 'left_nee'"),
-        (lambda walk: retargeting.retarget(walk, 'raptor', {'root': 'root', 'left_knee': 'knee'}),
-         "joint of the motion 'knee'; did you mean"),
-        (lambda walk: retargeting.retarget(walk, 'dog'), 'the root, or all other joints'),
-        (lambda walk: retargeting.retarget(walk, 'raptor', scale=0), 'scale is 0'),
-        (lambda walk: retargeting.cycle(walk, start=0.1), 'both or none'),
-        (lambda walk: retargeting.cycle(walk, 0.5, 3.0), 'expected 0 <= start < end <= 1 s'),
-        (lambda walk: retargeting.cycle(CycleTest.unrolled(None, 'biped2d_walk', 0.2)), 'lasts 0.2 s'),
-        (lambda _: motion.read_bvh(__file__, forward='w'), "forward is 'w'"),
-        (lambda _: motion.read_bvh(__file__, forward='-y'), 'expected two axes'),
-    )  # fmt: skip
-    def test_errors(self, call, message):
-        with self.assertRaisesRegex(ValueError, message):
-            call(dataclasses.replace(motion.load('biped2d_walk'), loop=False))
+    def test_errors(self):
+        walk = dataclasses.replace(motion.load('biped2d_walk'), loop=False)
+        short = CycleTest.unrolled(None, 'biped2d_walk', 0.2)
+        mapped = lambda ours, theirs: {'root': 'root', ours: theirs}  # noqa: E731
+        assert_refused(self, *((lambda c=c: c[0](*c[1:]), message) for *c, message in (
+            (clip_check.check, walk, 'raptor', "'biped2d_walk'.*does not fit 'raptor'"),
+            (retargeting.retarget, walk, 'raptor', mapped('left_nee', 'left_knee'), "unknown joint of the character 'left_nee'"),
+            (retargeting.retarget, walk, 'raptor', mapped('left_knee', 'knee'), "joint of the motion 'knee'; did you mean"),
+            (retargeting.retarget, walk, 'dog', 'the root, or all other joints'),
+            (retargeting.retarget, walk, 'raptor', None, 0, 'scale is 0'), (retargeting.cycle, walk, 0.1, 'both or none'),
+            (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1 s'), (retargeting.cycle, short, 'lasts 0.2 s'),
+            (motion.read_bvh, __file__, 0.01, 'w', "forward is 'w'"),
+            (motion.read_bvh, __file__, 0.01, '-y', 'expected two axes'),
+        )))  # fmt: skip
 
     def test_joints_beyond_their_limits(self):
         clip = motion.load('biped2d_walk')
