@@ -3,10 +3,10 @@
 import ctypes
 import dataclasses
 
-import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import assert_refused, links_on_ground, made
+from imitation_test import PlanarProbe
 
 from trl_suite import controllers, suite, terrain
 from trl_suite.engine import native
@@ -72,61 +72,30 @@ def around_physics(environment, before=None, after=None):
     }
     for number, call in calls.items():
         functions[number] = ctypes.cast(call, ctypes.c_void_p).value
-    environment.calls = calls  # keeps it alive
+    environment.calls = getattr(environment, 'calls', ()), calls  # keeps them alive
 
 
-class Probe:
-    """Reads an environment's state by names, with the engine's own functions."""
-
-    def __init__(self, environment):
-        self.environment, self.task = environment, environment.task
-        self.model, self.data = environment.physics.model.ptr, environment.physics.data.ptr
-        self.spec = self.task.character.spec
-        self.name, self.links = self.spec.name, self.spec.links
-
-    def body(self, link):
-        return self.model.body(f'{self.name}/{link}').id
-
-    def joint(self, name):
-        joint = self.model.joint(f'{self.name}/{name}')
-        return self.data.qpos[joint.qposadr[0]], self.data.qvel[joint.dofadr[0]]
-
-    @property
-    def root(self):
-        return np.array([self.joint('root_x/')[0], self.joint('root_z/')[0]])
-
-    def velocity(self, link):
-        result = np.zeros(6)
-        mujoco.mj_objectVelocity(
-            self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, self.body(link), result, 0
-        )
-        return result[[3, 5]]
+class Probe(PlanarProbe):
+    def rate(self, name):
+        return self.joint(name, 'qvel')[0]
 
     def touching(self):
         return links_on_ground(self.environment)
 
+    def com(self):
+        return self.centre_of_mass()[0][0]
+
     def observation(self, left_stance):
-        x, z = self.root
-        facing = -1.0 if np.cos(self.joint('root_pitch/')[0]) < 0 else 1.0
-        strip = terrain.PlanarGround.from_state(self.task.arena.grounds[0].state())
-        under = strip.height([x])
-        heading = np.array([facing, 1.0])
         order = list(self.links)
         if left_stance:
             swap = {'right': 'left', 'left': 'right'}
             order = ['_'.join([swap.get(part, part) for part in link.split('_')]) for link in order]
-        centres = {n: (self.data.xipos[self.body(n)][[0, 2]] - (x, z)) * heading for n in order}
-        pose = np.concatenate([z - under, *(centres[link] for link in order[1:])])
-        velocity = np.concatenate([self.velocity(link) * heading for link in order])
+        found = self.blocks(np.linspace(-0.5, 10, 200), order)
+        found['pose'] = np.delete(found['pose'], (1, 2))  # of the root
         if self.name == 'hopper':
-            pose[-1], velocity[-1] = self.joint('root_pitch/')
-        samples = x + facing * (-0.5 + 10.5 * np.arange(200) / 199)
-        return {'terrain': strip.height(samples) - under, 'pose': pose, 'velocity': velocity}
-
-    def com(self):
-        masses = [self.model.body_mass[self.body(link)] for link in self.links]
-        centres = [self.data.xipos[self.body(link)][0] for link in self.links]
-        return float(np.dot(masses, centres) / sum(masses))
+            found['pose'][-1] = self.joint('root_pitch/')[0]
+            found['velocity'][-1] = self.rate('root_pitch/')
+        return found
 
 
 class ObservationTest(parameterized.TestCase):
@@ -135,9 +104,9 @@ class ObservationTest(parameterized.TestCase):
     @parameterized.parameters(*EXAMPLES)
     def test_contents(self, id_):
         environment = make(id_, seed=3)
-        probe, left = Probe(environment), False
-        rng = np.random.default_rng(0)
+        rng, left = np.random.default_rng(0), False
         step, seen = environment.reset(), set()
+        probe = Probe(environment)
         for _ in range(6):
             for name, expected in probe.observation(left).items():
                 np.testing.assert_allclose(
@@ -151,13 +120,6 @@ class ObservationTest(parameterized.TestCase):
                 left = not left
         self.assertLen(seen, 2 if id_ in (RAPTOR, BIPED) else 1)
         self.assertGreater(np.ptp(step.observation['terrain']), 0.05)
-
-    def test_the_last_numbers_of_the_hopper(self):
-        environment = make(HOPPER, start_noise=0.0)
-        observation = environment.reset().observation
-        self.assertAlmostEqual(observation['pose'][-1], -0.00686)
-        self.assertAlmostEqual(observation['velocity'][-1], 0.100682)
-        self.assertAlmostEqual(observation['velocity'][0], 2.813878, delta=0.1)
 
     @parameterized.parameters(1, 3)
     def test_a_backward_heading_observes_the_ground_behind(self, n):
@@ -186,42 +148,41 @@ class StartTest(parameterized.TestCase):
     def test_velocity_and_place(self, id_):
         environment = make(id_)
         probe = Probe(environment)
-        rates = [probe.joint(f'root_{axis}/')[1] for axis in ('x', 'z', 'pitch')]
+        rates = [probe.rate(f'root_{axis}/') for axis in ('x', 'z', 'pitch')]
         np.testing.assert_allclose(rates, STARTS[id_])
         figures = controllers.load(probe.name).start
-        x, z = probe.root
+        x, _, z = probe.root
         self.assertEqual(x, 0.0)
         self.assertGreaterEqual(z, figures['height'] - 1e-12)
         self.assertLess(z, figures['height'] + 0.05)
         self.assertEqual(probe.joint('root_pitch/')[0], figures['pitch'])
         for name, expected in figures['joints'].items():
-            np.testing.assert_allclose(probe.joint(name), expected, err_msg=name)
+            found = probe.joint(name)[0], probe.rate(name)
+            np.testing.assert_allclose(found, expected, err_msg=name)
         self.assertFalse(probe.touching() - set(EXEMPT[id_]))
         observation = environment.reset().observation
-        np.testing.assert_array_equal(Probe(environment).root, (x, z))  # without noise, always so
+        np.testing.assert_array_equal(
+            Probe(environment).root, (x, 0, z)
+        )  # without noise, always so
         flat = np.linspace(-0.5, 10, 200) < 0.95  # the ground up to 1 m ahead
         np.testing.assert_allclose(observation['terrain'][flat], 0, atol=1e-12)
 
-    def test_the_largest_noise_stays_finite(self):
-        environment = make(DOG, start_noise=1.0)
-        for _ in range(20):
-            for step in (environment.reset(), environment.step(idle(environment))):
-                for value in step.observation.values():
-                    self.assertTrue(np.isfinite(value).all())
-
     def test_noise(self):
-        clean, noisy = make(DOG), make(DOG, start_noise=0.05)
+        clean, noisy = Probe(make(DOG)), Probe(make(DOG, start_noise=0.05))
+        names = clean.task.character.spec.joints
         found = []
         for _ in range(40):
-            noisy.reset()
-            a, b = Probe(clean), Probe(noisy)
-            names = clean.task.character.spec.joints
-            angles, rates = np.array([np.subtract(b.joint(n), a.joint(n)) for n in names]).T
-            found.append((*angles, *rates / 10, (b.joint('root_x/')[1] - STARTS[DOG][0]) / 10))
-            self.assertEqual(b.joint('root_pitch/'), a.joint('root_pitch/'))
+            noisy.environment.reset()
+            angles = [(noisy.joint(n) - clean.joint(n))[0] for n in names]
+            rates = [noisy.rate(n) - clean.rate(n) for n in (*names, 'root_x/')]
+            found.append(np.append(angles, np.divide(rates, 10)))
+            self.assertEqual(noisy.joint('root_pitch/'), clean.joint('root_pitch/'))
         self.assertBetween(np.std(found), 0.045, 0.055)
         self.assertLess(abs(np.mean(found)), 0.01)
         self.assertBetween(np.std(np.array(found)[:, -1]), 0.03, 0.07)
+        environment = make(DOG, start_noise=1.0)  # the largest
+        for step in (environment.reset(), environment.step(idle(environment))):
+            self.assertTrue(np.isfinite(np.concatenate([*step.observation.values()])).all())
 
     def test_where_the_ground_begins(self):
         x = np.linspace(-0.95, 0.95, 50)
@@ -234,28 +195,22 @@ class StartTest(parameterized.TestCase):
 class RewardTest(parameterized.TestCase):
     """One value per cycle."""
 
-    def worked(self, id_, speed, share):
-        """Reward of a cycle of 0.4 s with a mean speed and a share of stumbling."""
+    def expected(self, id_, speed, share):
+        """Reward of a mean speed, m/s, and a share of the time that it stumbled."""
+        if id_ == RAPTOR and speed < 0:
+            return 0.0
+        near = np.exp(-0.5 * (TARGETS[id_] - speed) ** 2)
+        return near if id_ == HOPPER else 0.8 * near + 0.2 / (1 + 10 * share)
+
+    @parameterized.product(id_=EXAMPLES, speed=(-1.0, -0.01, 0.01, 2.0, 4.0, 5.0), share=(0.0, 0.5))
+    def test_speeds(self, id_, speed, share):
         environment = make(id_)
         task = environment.task
         task.state.lasted[:] = 240
         task.state.stumbled[:] = round(240 * share)
         task.state.start[:] = Probe(environment).com() - 0.4 * speed
         task.finish_step(np.arange(1))
-        terms = environment.info['reward_terms']
-        self.assertAlmostEqual(sum(terms.values()), float(task.reward[0]), places=12)
-        return float(task.reward[0])
-
-    @parameterized.parameters(
-        (DOG, 4.0, 0.0, 1.0), (DOG, 3.0, 0.0, 0.6852), (DOG, 4.0, 0.1, 0.9), (DOG, 0.0, 0.0, 0.2003),
-        (DOG, -1.0, 0.0, 0.2), (DOG, 5.0, 0.0, 0.6852), (DOG, 4.0, 1.0, 0.8 + 0.2 / 11),
-        (RAPTOR, 4.0, 0.0, 1.0), (RAPTOR, 3.0, 0.1, 0.5852), (RAPTOR, -0.01, 0.0, 0.0),
-        (RAPTOR, 0.01, 0.0, 0.2003), (GOAT, 2.0, 0.0, 1.0), (GOAT, 1.0, 0.0, 0.6852),
-        (BIPED, 3.0, 0.0, 1.0), (BIPED, -0.5, 0.0, 0.2017), (HOPPER, 3.0, 0.0, 1.0),
-        (HOPPER, 4.0, 0.5, 0.6065), (HOPPER, 3.0, 1.0, 1.0),
-    )  # fmt: skip
-    def test_worked_values(self, id_, speed, share, expected):
-        self.assertAlmostEqual(self.worked(id_, speed, share), expected, places=4)
+        self.assertAlmostEqual(float(task.reward[0]), self.expected(id_, speed, share), places=9)
 
     @parameterized.parameters(*EXAMPLES)
     def test_rollout(self, id_):
@@ -277,6 +232,7 @@ class RewardTest(parameterized.TestCase):
             self.assertAlmostEqual(info['duration'], len(stumbles) * STEP, places=9)
             self.assertAlmostEqual(info['stumbled'], sum(stumbles) * STEP, places=9)
             self.assertEqual(info['distance'], probe.root[0])
+            self.assertAlmostEqual(sum(info['reward_terms'].values()), step.reward, places=12)
             stumbled += sum(stumbles)
             if step.last():
                 self.assertEqual((step.reward, step.discount), (0.0, 0.0))
@@ -284,12 +240,7 @@ class RewardTest(parameterized.TestCase):
                 environment.reset()
                 continue
             speed = (probe.com() - com) / duration
-            near = np.exp(-0.5 * (TARGETS[id_] - speed) ** 2)
-            expected = 0.8 * near + 0.2 / (1 + 10 * sum(stumbles) * STEP / duration)
-            if id_ == HOPPER:
-                expected = near
-            elif id_ == RAPTOR and speed < 0:
-                expected = 0.0
+            expected = self.expected(id_, speed, sum(stumbles) * STEP / duration)
             self.assertAlmostEqual(step.reward, expected, places=9)
             self.assertEqual(step.discount, 1.0)
         if id_ == DOG:
@@ -299,21 +250,32 @@ class RewardTest(parameterized.TestCase):
 class Adrift:
     """An environment whose character floats at rest, and feels what contacts a test gives it."""
 
-    def __init__(self, id_, pitch=0.0, velocity=(0, 0, 0), **options):
-        self.environment = make(id_, fresh=True, **options)
+    made = {}  # noqa: RUF012  # by id, for all tests
+
+    def __init__(self, id_):
+        self.environment = make(id_, fresh=True)
+        self.links = self.environment.task.character.spec.links
+        self.environment.physics.model.opt.gravity[:] = 0
+        first = self.environment.task.gait.rules.machine.contact
+        self.sensed = self.environment.physics.data.sensordata[first : first + len(self.links)]
+        around_physics(self.environment, self.let_go, self.touch)
+
+    @classmethod
+    def begun(cls, id_, contacts=lambda time: (), pitch=0.0, velocity=(0, 0, 0)):
+        if id_ not in cls.made:
+            cls.made[id_] = cls(id_)
+        self = cls.made[id_]
         environment, task = self.environment, self.environment.task
-        self.links = task.character.spec.links
-        environment.physics.model.opt.gravity[:] = 0
-        environment.physics.data.qvel[:] = 0
+        self.time, self.contacts = 0, lambda time: ()
+        environment.reset()
         data = environment.physics.data
+        data.qvel[:] = 0
         data.qpos[task.figure.pose_qpos[1:3]] = 8.0, pitch
         data.qvel[task.figure.pose_dof[:3]] = velocity
         task.world.forward(np.zeros(1, int))
         task.state.milestone[:] = 0.0, 8.0
-        self.time, self.contacts = 0, lambda time: ()
-        first = task.gait.rules.machine.contact
-        self.sensed = environment.physics.data.sensordata[first : first + len(self.links)]
-        around_physics(environment, self.let_go, self.touch)
+        self.time, self.contacts = 0, contacts
+        return self
 
     def let_go(self):
         self.environment.physics.data.ctrl[:] = 0
@@ -330,87 +292,62 @@ class Adrift:
         return None
 
 
+FORWARD = {'velocity': (1, 0, 0)}
+# Environment, links on the ground at a time in s, options of `Adrift`; when the episode ends, s, and how.
+ENDS = (
+    # Four samples on the ground, in the middle of a cycle.
+    *((id_, lambda time, link=link: (link,), {}, 0.4, 'fell')
+      for id_, link in ((DOG, 'torso'), (GOAT, 'spine0'), (RAPTOR, 'head'), (BIPED, 'root'), (HOPPER, 'root'))),
+    # Other links, short contacts, and contacts between samples are not a fall.
+    *((id_, lambda time, link=link: (link,), FORWARD, None, '')
+      for id_, link in ((DOG, 'knee'), (GOAT, 'torso'), (RAPTOR, 'tail3'), (BIPED, 'left_hip'))),
+    (DOG, lambda time: ('head',) if 0.05 < time < 0.35 else (), FORWARD, None, ''),
+    (DOG, lambda time: ('head',) if 0.02 < time % 0.1 < 0.08 else (), FORWARD, None, ''),
+    # Every so many of the samples: S <- 0.9 S + c / 11 > 0.25.
+    *((DOG, lambda time, k=k: () if round(time * 10) % k else ('head',), FORWARD, end, 'fell')
+      for k, end in ((3, 1.5), (4, 2.8), (5, None))),
+    # Upside down: a pitch of more than 0.8 pi.
+    *((id_, lambda time: (), {'pitch': pitch, **FORWARD}, end, 'fell') for id_ in EXAMPLES
+      for pitch, end in ((2.6, 0.1), (-2.6, 0.1), (2.4, None), (-2.4, None), (2 * np.pi, None))),
+    # Only the biped fails when it moves back.
+    *((id_, lambda time: (), {'velocity': (-1, 0, 0)}, end, 'fell')
+      for id_, end in ((BIPED, 0.1), (DOG, None), (RAPTOR, None), (HOPPER, None))),
+    # Less than half a metre in 5 s; vertical motion counts as well.
+    *((RAPTOR, lambda time: (), {'velocity': velocity}, end, 'stuck')
+      for velocity, end in (((0, 0, 0), 5.0), ((0.09, 0, 0), 5.0), ((0.11, 0, 0), None), ((0, 0.2, 0), None))),
+)  # fmt: skip
+
+
+def tearDownModule():
+    Adrift.made.clear()
+
+
 class FallTest(parameterized.TestCase):
     """What ends an episode."""
 
-    @parameterized.parameters((DOG, 'torso'), (GOAT, 'spine0'), (RAPTOR, 'head'), (BIPED, 'root'),
-                              (HOPPER, 'root'))  # fmt: skip
-    def test_four_samples_on_the_ground(self, id_, link):
-        adrift = Adrift(id_)
-        adrift.contacts = lambda time: (link,)
-        self.assertAlmostEqual(adrift.lasts(), 0.4)
+    @parameterized.parameters(*ENDS)
+    def test_ends(self, id_, contacts, options, end, how):
+        adrift = Adrift.begun(id_, contacts, **options)
+        found = adrift.lasts((end or (5 if how == 'stuck' else 2.5)) + 0.9)
+        self.assertEqual(found is None, end is None)
         info = adrift.environment.info
-        self.assertEqual((info['fell'], info['stuck'], info['diverged']), (True, False, False))
+        if end is None:
+            self.assertFalse(info['fell'] or info['stuck'])
+            return
+        self.assertAlmostEqual(found, end)
+        self.assertEqual(
+            (info['fell'], info['stuck'], info['diverged']), (how == 'fell', how == 'stuck', False)
+        )
         self.assertEqual(adrift.environment.task.get_discount(None), 0.0)
-        self.assertAlmostEqual(info['duration'], 0.4)  # in the middle of the cycle
+        self.assertEqual(float(adrift.environment.task.reward[0]), 0.0)
 
-    @parameterized.parameters(
-        (DOG, 'knee'), (GOAT, 'torso'), (RAPTOR, 'tail3'), (BIPED, 'left_hip')
-    )
-    def test_contact_of_other_links_is_not_a_fall(self, id_, link):
-        adrift = Adrift(id_, velocity=(1, 0, 0))
-        adrift.contacts = lambda time: (link,)
-        self.assertIsNone(adrift.lasts(3.0))
+    def test_contacts_of_other_links_are_a_stumble(self):
+        adrift = Adrift.begun(DOG, lambda time: ('knee',), **FORWARD)
+        adrift.lasts(3.0)
         self.assertAlmostEqual(adrift.environment.info['stumbled'], 50 / 30)  # the last cycle
 
-    def test_short_contacts_are_not_a_fall(self):
-        adrift = Adrift(DOG, velocity=(1, 0, 0))
-        adrift.contacts = lambda time: ('head',) if 0.05 < time < 0.35 else ()
-        self.assertIsNone(adrift.lasts(3.0))
-        adrift = Adrift(DOG, velocity=(1, 0, 0))
-        # Between two samples, contacts have no effect.
-        adrift.contacts = lambda time: ('head',) if 0.02 < time % 0.1 < 0.08 else ()
-        self.assertIsNone(adrift.lasts(3.0))
-        self.assertGreater(adrift.environment.info['stumbled'], 0.9)
-
-    @parameterized.parameters((3, True), (4, True), (5, False))
-    def test_a_large_share_of_contacts_is_a_fall(self, every, falls):
-        adrift = Adrift(DOG, velocity=(1, 0, 0))
-        adrift.contacts = lambda time: () if round(time * 10) % every else ('head',)
-        share, expected = 0.0, None
-        for sample in range(1, 60):
-            share = 0.9 * share + (sample % every == 0) / 11
-            if share > 0.25 and expected is None:
-                expected = sample / 10
-        found = adrift.lasts(5.9)
-        self.assertEqual(expected is not None, falls)
-        if falls:
-            self.assertAlmostEqual(found, expected)
-        else:
-            self.assertIsNone(found)
-
-    @parameterized.product(id_=EXAMPLES, pitch=(2.6, -2.6, 2.4, -2.4, 2 * np.pi))
-    def test_upside_down(self, id_, pitch):
-        adrift = Adrift(id_, pitch=pitch, velocity=(1, 0, 0))
-        ends = adrift.lasts(0.5)
-        if abs(pitch) == 2.6:  # more than 0.8 pi
-            self.assertAlmostEqual(ends, 0.1)
-            self.assertTrue(adrift.environment.info['fell'])
-        else:
-            self.assertIsNone(ends)
-
-    @parameterized.parameters((BIPED, 0.1), (DOG, None), (RAPTOR, None), (HOPPER, None))
-    def test_only_the_biped_fails_when_it_moves_back(self, id_, expected):
-        adrift = Adrift(id_, velocity=(-1, 0, 0))
-        found = adrift.lasts(1.0)
-        self.assertEqual(found is None, expected is None)
-        if expected:
-            self.assertAlmostEqual(found, expected)
-            self.assertTrue(adrift.environment.info['fell'])
-
-    def test_stuck(self):
-        for speed, ends in ((0.0, 5.0), (0.09, 5.0), (0.11, None)):
-            adrift = Adrift(RAPTOR, velocity=(speed, 0, 0))
-            found = adrift.lasts(6.0)
-            if ends is None:
-                self.assertIsNone(found)
-                continue
-            self.assertAlmostEqual(found, ends)
-            info = adrift.environment.info
-            self.assertEqual((info['fell'], info['stuck'], info['diverged']), (False, True, False))
-            self.assertEqual(float(adrift.environment.task.reward[0]), 0.0)
-        # Vertical motion counts as well; the window restarts every 5 s.
-        adrift = Adrift(RAPTOR, velocity=(0, 0.2, 0))
+    def test_the_window_in_which_it_is_stuck_restarts_every_5_seconds(self):
+        adrift = Adrift.begun(RAPTOR, velocity=(0, 0.2, 0))
         self.assertIsNone(adrift.lasts(6.0))
         adrift.environment.physics.data.qvel[:] = 0
         self.assertAlmostEqual(adrift.lasts(15.1), 10.0)
@@ -448,7 +385,7 @@ class CycleTest(parameterized.TestCase):
 
     @parameterized.parameters(DOG, RAPTOR)
     def test_a_cycle_that_does_not_end_is_truncated(self, id_):
-        adrift = Adrift(id_, velocity=(1, 0, 0))
+        adrift = Adrift.begun(id_, **FORWARD)
         environment = adrift.environment
         for _ in range(2):
             step = environment.step(idle(environment))
@@ -457,7 +394,7 @@ class CycleTest(parameterized.TestCase):
         stuck_in = {DOG: 1, RAPTOR: 3}[id_]
         self.assertEqual(environment.task.gait.state.number[0], stuck_in)
         # The next action begins a cycle all the same.
-        adrift.contacts = lambda time: ()
+        del Adrift.made[id_]
         seen, number = [], environment.task.gait.state.number
         around_physics(environment, before=lambda: seen.append(int(number[0])))
         environment.step(idle(environment))
@@ -477,6 +414,10 @@ class CycleTest(parameterized.TestCase):
             expected[:, gait.parameters.absolute] = np.abs(expected[:, gait.parameters.absolute])
             for vectors in (seen[0], seen[-1]):
                 np.testing.assert_array_equal(vectors, expected)
+        environment = make(RAPTOR, substeps=4)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 2400)
+        environment.step(idle(environment))
+        self.assertAlmostEqual(environment.physics.data.time, environment.info['duration'])
 
 
 class BaseActionTest(parameterized.TestCase):
@@ -542,9 +483,8 @@ class BaseActionTest(parameterized.TestCase):
 REFUSED = (
     ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
     ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
-    ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
-    ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
-    ({'start_noise': np.inf}, 'start_noise is inf'), ({'start_noise': 1e300}, 'from 0 to 1, in rad'), ({'spawn': 'here'}, "'here'"),
+    ({'substeps': 0}, 'substeps is 0'), ({'spawn': 'here'}, "'here'"),
+    ({'start_noise': np.nan}, 'start_noise is nan'), ({'start_noise': 1e300}, 'from 0 to 1, in rad'),
     ({'terrain_observation': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
 )  # fmt: skip
 DO_NOT_FIT = (
@@ -561,16 +501,6 @@ class OptionTest(parameterized.TestCase):
             *((lambda o=o: suite.make(DOG, o), message) for o, message in REFUSED),
             *((lambda a=a, o=o: suite.build(*a, **{'task': 'gait', **o}), m) for a, o, m in DO_NOT_FIT),
         )  # fmt: skip
-
-    def test_build(self):
-        for actuation in (None, 'gait'):
-            environment = suite.build(
-                'raptor', actuation, 'gaps', task='gait', task_kwargs={'random': 0, 'substeps': 4}
-            )
-            self.assertAlmostEqual(environment.physics.timestep(), 1 / 2400)
-            environment.reset()
-            environment.step(idle(environment))
-            self.assertAlmostEqual(environment.physics.data.time, environment.info['duration'])
 
 
 class GaitTest(parameterized.TestCase):
