@@ -1,17 +1,18 @@
-"""The benchmark: core set, runs in parts, results, verification, and reports."""
+"""The benchmark: core set, verification, reports, and standard learners."""
 
 import contextlib
-import copy
 import dataclasses
 import json
 import pathlib
+import shutil
 import sys
 import tempfile
 from unittest import mock
 
-import cli_test
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import FolderTest, assert_refused
+from programs import CommandTest
 
 from trl_suite import benchmark, evaluation, policies, runs, suite
 from trl_suite.benchmark import core, report
@@ -28,130 +29,24 @@ class CoreTest(parameterized.TestCase):
             {'plaid': 3, 'imitation': 3, 'terrainrl': 3, 'deeploco': 3},
         )
 
-    @parameterized.parameters(*benchmark.CORE)
-    def test_scales(self, id_):
-        of = benchmark.scales()[id_]
-        low, high = benchmark.ends(id_)
-        self.assertEqual((low, high), (max(of['zero'], of['random']), of['shipped']))
-        self.assertLess(low + 0.1, high)
-        self.assertLessEqual(high, 1)
-        self.assertEqual(benchmark.normalised(id_, low), 0)
-        self.assertEqual(benchmark.normalised(id_, high), 1)
-
-    def test_what_was_measured(self):
+    def test_scales(self):
         made = json.loads(core.SCALES.read_text())
         self.assertEqual(made['format'], benchmark.BENCHMARK.format)
         self.assertEqual([*made['scores']], [*benchmark.CORE])
-        self.assertGreaterEqual(min(row['episodes'] for row in made['scores'].values()), 16)
+        for id_, of in made['scores'].items():
+            low, high = benchmark.ends(id_)
+            self.assertEqual((low, high), (max(of['zero'], of['random']), of['shipped']))
+            self.assertLess(low + 0.1, high)
+            self.assertLessEqual(high, 1)
+            self.assertEqual(benchmark.normalised(id_, low), 0)
+            self.assertEqual(benchmark.normalised(id_, high), 1)
+            self.assertGreaterEqual(of['episodes'], 16)
 
     def test_step_limits(self):
         self.assertEqual(benchmark.get(ID).spec(ID).step_limit, 256)
         gait = benchmark.get('FSM_Dog2D_Terrain_Mixed-v0')
         stage = runs.Stage(gait, 0, 100, 0, 1)
         self.assertEqual(stage.environments(1).step_limit, core.GAIT_LIMIT)
-
-    def test_unknown_environments(self):
-        with self.assertRaisesRegex(
-            ValueError, "unknown environment 'PD_Biped2D_Gap.*did you mean"
-        ):
-            benchmark.get('PD_Biped2D_Gap_Terrain-v0')
-
-
-class Counter:
-    """A learner that takes 7 samples of what it may, and whose scores are made up."""
-
-    def __init__(self, course=None, seed=0, stop_at=None):
-        self.budgets, self.stop_at = [], stop_at
-
-    def train(self, stage):
-        if len(self.budgets) == self.stop_at:
-            raise KeyboardInterrupt
-        self.budgets.append(stage.budget)
-        stage.spend(0, min(stage.left, 7))
-
-    def policy(self):
-        return len(self.budgets)
-
-    def save(self, folder):
-        (folder / 'budgets.json').write_text(json.dumps(self.budgets))
-
-    def load(self, folder):
-        self.budgets = json.loads((folder / 'budgets.json').read_text())
-
-
-class Other(Counter):
-    pass
-
-
-def made_up(cases, episodes, seeds, threads, executor):
-    assert min(seeds) >= runs.FIRST_TEST_SEED and len(seeds) == episodes
-    low, high = benchmark.ends(ID)
-    for spec, parts in cases:
-        assert spec.id in benchmark.CORE
-        yield {'normalized_return': low + (high - low) * parts / 20 * 0.8}
-
-
-class RunTest(parameterized.TestCase):
-    def setUp(self):
-        super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.path = self.folder / 'result.json'
-        self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
-        self.enterContext(mock.patch.object(running.time, 'perf_counter', lambda: 0.0))
-
-    def run_short(self, learner, path=None, **changes):
-        return benchmark.run(ID, learner, **{'budget': 200, 'path': path or self.path, **changes})
-
-    def test_parts(self):
-        """Of 10 samples each; what is left of one is for the next."""
-        learner = Counter()
-        result = self.run_short(learner)
-        self.assertEqual(learner.budgets, [10 + 3 * i for i in range(20)])
-        self.assertEqual(result['samples'], [[7]] * 20)
-        self.assertAlmostEqual(result['metrics']['score'], 0.8)
-        self.assertAlmostEqual(result['metrics']['mean_score'], 0.8 * 10.5 / 20)
-        self.assertEqual(benchmark.read(self.path), result)
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
-
-    @parameterized.parameters(0, 1, 13)
-    def test_a_stopped_run_resumes(self, stop_at):
-        whole = self.run_short(Counter(), self.folder / 'whole.json')
-        with self.assertRaises(KeyboardInterrupt):
-            self.run_short(Counter(stop_at=stop_at))
-        self.assertEqual(self.run_short(Counter()), whole)
-
-    def test_what_is_comparable(self):
-        result = self.run_short(Counter(), seed=7, episodes=4)
-        notes = benchmark.departures(result)
-        self.assertEqual(notes, [
-            'budget is 200, not 1000000 or 10000000', 'episodes is 4, not 32',
-            'seed is 7, not 0 or 1 or 2 or 3 or 4',
-        ])  # fmt: skip
-        same = {**result, 'budget': 10**6, 'episodes': 32, 'seed': 4}
-        self.assertEqual(benchmark.departures(same), [])
-
-    @parameterized.parameters(
-        ('format', 'trl_suite benchmark 0', "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'"),
-        ('environment', 'PD_Dog2D_Flat_Terrain-v0', "unknown environment of the core set 'PD_Dog2D_Flat"),
-        ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps"),
-        ('samples', [[7]] * 19 + [[100]], r'samples\[19\] is \[100\], in total 100; .* at most 67'),
-        ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20'),
-        ('metrics', {'score': 0.9, 'mean_score': 0.42}, r'metrics.score is 0.9; expected 0.(8|79)'),
-        ('policy', 7, 'policy is 7; expected a string'),
-        ('seconds', [1.0] * 20, 'digest is .* changed after the run'),
-    )  # fmt: skip
-    def test_edited_results(self, name, value, message):
-        result = self.run_short(Counter())
-        result[name] = value
-        if name != 'seconds':
-            result['digest'] = results.digest(result)
-        with self.assertRaisesRegex(ValueError, message):
-            benchmark.check(result)
-
-    def test_a_policy_of_the_user_is_not_replaced(self):
-        (self.folder / 'result.npz').write_text('own')
-        with self.assertRaisesRegex(FileExistsError, 'result.npz: exists; remove it, or choose'):
-            self.run_short(Counter())
 
 
 class Shipped:
@@ -167,58 +62,56 @@ class Shipped:
         return policies.reference(self.id)
 
 
-class VerifyTest(parameterized.TestCase):
-    def setUp(self):
-        super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.path = self.folder / 'result.json'
+class VerifyTest(FolderTest):
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
         # With two parts instead of twenty.
         courses = {ID: dataclasses.replace(benchmark.get(ID), parts=2)}
-        self.benchmark = dataclasses.replace(benchmark.BENCHMARK, courses=courses)
-        learner = Shipped(courses[ID], 0)
-        self.result = self.benchmark.run(ID, learner, 2, self.path, 2, 3, 1)
+        cls.benchmark = dataclasses.replace(benchmark.BENCHMARK, courses=courses)
+        cls.made = pathlib.Path(cls.enterClassContext(tempfile.TemporaryDirectory()), 'result.json')
+        cls.result = cls.benchmark.run(ID, Shipped(courses[ID], 0), 2, cls.made, 2, 3, 1)
+
+    def setUp(self):
+        super().setUp()
+        self.path, self.stored = (
+            pathlib.Path(shutil.copy(self.made.with_suffix(suffix), self.folder))
+            for suffix in ('.json', '.npz')
+        )
 
     def write(self, **changes):
-        result = {**copy.deepcopy(self.result), **changes}
-        result['digest'] = results.digest(result)
-        self.path.write_text(json.dumps(result))
+        result = {**self.result, **changes}
+        self.path.write_text(json.dumps({**result, 'digest': results.digest(result)}))
+
+    def verify(self):
+        return self.benchmark.verify(self.path, 1)
 
     def test_entries(self):
-        self.assertEqual(self.benchmark.verify(self.path, 2), self.result)
+        self.assertEqual(self.verify(), self.result)
         scores = self.result['scores']
         self.write(scores=[scores[0], [np.nextafter(scores[1][0], 0)]])
-        with self.assertRaisesRegex(ValueError, r'scores\[-1\] is .*; measured'):
-            self.benchmark.verify(self.path, 1)
+        assert_refused(self, (self.verify, r'scores\[-1\] is .*; measured'))
 
     def test_one_changed_weight(self):
-        stored = self.path.with_suffix('.npz')
-        policy = policies.load(stored)
+        policy = policies.load(self.stored)
         weight = policy.weights[1].copy()
         weight[3, 5] += 1e-3
         weights = policy.weights[0], weight, *policy.weights[2:]
-        policies.save(dataclasses.replace(policy, weights=weights), stored)
-        with self.assertRaisesRegex(
-            ValueError, 'policy is .*one of the two was changed after the run'
-        ):
-            self.benchmark.verify(self.path, 1)
-        self.write(policy=running._sha256(stored))
-        with self.assertRaisesRegex(ValueError, r'scores\[-1\] is \[0.*\]; measured \[0'):
-            self.benchmark.verify(self.path, 1)
+        policies.save(dataclasses.replace(policy, weights=weights), self.stored)
+        assert_refused(self, (self.verify, 'policy is .*one of the two was changed after the run'))
+        self.write(policy=running._sha256(self.stored))
+        assert_refused(self, (self.verify, r'scores\[-1\] is \[0.*\]; measured \[0'))
         # Made on another class of processor, it is within the tolerance.
-        self.write(policy=running._sha256(stored), cpu='other')
-        self.benchmark.verify(self.path, 1)
+        self.write(policy=running._sha256(self.stored), cpu='other')
+        self.verify()
 
-    def test_a_policy_of_another_environment(self):
-        stored = self.path.with_suffix('.npz')
-        policies.save(policies.reference('PD_Dog2D_Gaps_Terrain-v0'), stored)
-        self.write(policy=running._sha256(stored))
-        with self.assertRaisesRegex(ValueError, 'PD_Dog2D_Gaps_Terrain-v0'):
-            self.benchmark.verify(self.path, 1)
-
-    def test_no_policy(self):
-        self.path.with_suffix('.npz').unlink()
+    def test_a_policy_of_another_environment_or_none(self):
+        policies.save(policies.reference('PD_Dog2D_Gaps_Terrain-v0'), self.stored)
+        self.write(policy=running._sha256(self.stored))
+        assert_refused(self, (self.verify, 'PD_Dog2D_Gaps_Terrain-v0'))
+        self.stored.unlink()
         with self.assertRaisesRegex(FileNotFoundError, 'result.npz: there is no such file'):
-            self.benchmark.verify(self.path, 1)
+            self.verify()
 
 
 def result_of(learner, id_, seed, score, **changes):
@@ -303,77 +196,25 @@ class ReportTest(parameterized.TestCase):
                 report.report([first, *others])
 
 
-MODULE = """
-import numpy as np
-
-class Nothing:
-    def __init__(self, course, seed):
-        self.size = 11
-
-    def train(self, stage):
-        environments = stage.environments(2)
-        environments.reset()
-        environments.step(np.zeros((2, self.size)))
-
-    def policy(self):
-        return lambda observation: np.zeros((len(observation), self.size))
-
-class Greedy(Nothing):
-    def train(self, stage):
-        environments = stage.environments(2)
-        environments.reset()
-        while True:
-            environments.step(np.zeros((2, self.size)))
-"""
-
-
-class CommandTest(cli_test.CommandTest):
-    def test_run_check_and_report(self):
-        pathlib.Path('learner_of_benchmark.py').write_text(MODULE)
-        self.addCleanup(setattr, sys, 'path', list(sys.path))
-        command = (
-            'benchmark', 'run', ID, '--budget', '60', '--episodes', '1', '--threads', '1', '--learner',
-        )  # fmt: skip
-        with mock.patch.object(evaluation, 'evaluate_all', self.made_up):
-            out = self.output(*command, 'learner_of_benchmark:Nothing')
-            self.assertEqual(out, f'Nothing/{ID}_s0.json: score 0.500\n')
-            self.assert_refused(
-                r'stage 0 \(PD_Biped2D_Gaps.*2 more samples; expected at most 1, since 2 of 3',
-                *command, 'learner_of_benchmark:Greedy',
-            )  # fmt: skip
-        path = f'Nothing/{ID}_s0.json'
-        out = self.output('benchmark', 'check', path)
-        self.assertRegex(
-            out, f'{path}: learner_of_benchmark:Nothing, {ID}, budget 60.*not comparable: budget'
-        )
+class ReportCommandTest(CommandTest):
+    def test_results_of_a_folder(self):
+        learner = type('Nothing', (Shipped,), {'policy': lambda self: 0})
+        folder = pathlib.Path('Nothing')
+        for each in (folder, pathlib.Path('empty')):
+            each.mkdir()
+        low, high = benchmark.ends(ID)
+        scores = mock.Mock(return_value=[{'normalized_return': (low + high) / 2}])
+        with mock.patch.object(evaluation, 'evaluate_all', scores):
+            benchmark.run(ID, learner(benchmark.get(ID), 0), 60, folder / 'a.json')
         out = self.output('benchmark', 'report', 'Nothing', '--json', 'report.json')
-        self.assertIn('| learner_of_benchmark:Nothing | 1 | 0.500 (0.500 to 0.500) |', out)
+        self.assertRegex(out, r'Nothing \| 1 \| 0\.500 \(0\.500 to 0\.500\) \|')
         found = json.loads(pathlib.Path('report.json').read_text())
         self.assertEqual(found['environments'], [ID])
         self.assert_refused('there is no such file', 'benchmark', 'verify', 'Nothing')
-        text = pathlib.Path(path).read_text().replace('"seed": 0', '"seed": 1')
-        pathlib.Path('edited.json').write_text(text)
-        self.assert_refused('edited.json: digest is', 'benchmark', 'check', 'edited.json')
-        pathlib.Path('empty').mkdir()
         self.assert_refused('empty: has no results', 'benchmark', 'report', 'empty')
         self.assert_refused(
-            "unknown environment 'PD_Gap'",
-            'benchmark',
-            'run',
-            'PD_Gap',
-            *command[3:],
-            'learner_of_benchmark:Nothing',
+            "unknown environment 'PD_Gap'", 'benchmark', 'run', 'PD_Gap', '--learner', 'a:B'
         )
-
-    @staticmethod
-    def made_up(cases, *_, executor):
-        low, high = benchmark.ends(ID)
-        return [{'normalized_return': (low + high) / 2} for _ in cases]
-
-    def test_list(self):
-        out = self.output('benchmark', 'list')
-        for id_, course in benchmark.CORE.items():
-            self.assertRegex(out, rf'{id_} +0\.\d+ +0\.\d+ +\d+  {course.description}')
 
 
 with contextlib.suppress(ImportError):

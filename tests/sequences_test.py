@@ -1,4 +1,7 @@
-"""Sequences of environments: contents, seeds, budgets, metrics, resumed runs, and results."""
+"""Sequences and the benchmark, which are courses of `trl_suite.runs`: stages, runs and results.
+
+`benchmark_test` has what only the benchmark does.
+"""
 
 import concurrent.futures
 import contextlib
@@ -7,36 +10,37 @@ import json
 import os
 import pathlib
 import sys
-import tempfile
 from unittest import mock
 
-import cli_test
 import numpy as np
 import pytest
 import torch
 from absl.testing import absltest, parameterized
+from helpers import FolderTest, assert_refused
+from programs import CommandTest
 
-from trl_suite import evaluation, sequences, suite
+from trl_suite import benchmark, evaluation, sequences, suite
 from trl_suite.runs import results, running
 from trl_suite.util import machine
-from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import continual
 
 SHORT = sequences.Sequence('short', ('plaid/dog_flat', 'plaid/dog_steps', 'plaid/dog_gaps'))
+ID = 'PD_Biped2D_Gaps_Terrain-v0'
+# Both benchmarks, a course of each, and the samples per environment of a short run.
+SEQUENCES = sequences.BENCHMARK, SHORT, 7
+BENCHMARK = benchmark.BENCHMARK, benchmark.get(ID), 200
 
 
-class SequenceTest(parameterized.TestCase):
+class CatalogueTest(parameterized.TestCase):
     @parameterized.parameters(
         *(n for n in sequences.SEQUENCES if n.startswith(('plaid_long', 'gaits')))
     )
     def test_one_network_serves_all(self, name):
         sequence = sequences.get(name)
-        shapes = set()
-        for id_ in sequence.ids:
-            task = suite.build_task(suite.find(id_))
-            shapes.add((tuple(task.blocks.items()).__repr__(), tuple(task.action_map.names)))
+        tasks = [suite.build_task(suite.find(id_)) for id_ in sequence.ids]
+        shapes = {(repr([*task.blocks.items()]), tuple(task.action_map.names)) for task in tasks}
         self.assertLen(shapes, 1)
         self.assertEqual(sequence.name, name)
 
@@ -49,13 +53,17 @@ class SequenceTest(parameterized.TestCase):
         self.assertEqual(sequences.get(f'plaid_long_{figure}').ids[:5], ids)
         self.assertLen(sequences.get(f'plaid_long_{figure}'), 8)
 
-    def test_invalid_arguments_are_rejected(self):
-        with self.assertRaisesRegex(ValueError, "'plaid_bog'; did you mean 'plaid_dog'"):
-            sequences.get('plaid_bog')
-        with self.assertRaisesRegex(ValueError, "unknown environment 'PD_Bog2D_Gaps_Terrain-v0'"):
-            sequences.Sequence('mine', ('PD_Bog2D_Gaps_Terrain-v0', 'plaid/dog_flat'))
-        with self.assertRaisesRegex(ValueError, 'each once'):
-            sequences.Sequence('mine', ('plaid/dog_flat', 'PD_Dog2D_Flat_Terrain-v0'))
+    def test_unknown_names_are_refused(self):
+        def mine(*ids):
+            return lambda: sequences.Sequence('mine', ids)
+
+        assert_refused(
+            self,
+            (lambda: sequences.get('plaid_bog'), "'plaid_bog'; did you mean 'plaid_dog'"),
+            (lambda: benchmark.get(ID[:-1]), f"unknown environment '{ID[:-1]}'.*did you mean"),
+            (mine('PD_Bog2D_Gaps_Terrain-v0'), "unknown environment 'PD_Bog2D_Gaps_Terrain-v0'"),
+            (mine('plaid/dog_flat', 'PD_Dog2D_Flat_Terrain-v0'), 'each once'),
+        )
 
 
 class SeedsTest(absltest.TestCase):
@@ -67,15 +75,6 @@ class SeedsTest(absltest.TestCase):
         self.assertGreater(len(set(train)), 1990)
         self.assertEqual(train[:5], sequences.train_seeds(5, (1, 2)))
         self.assertNotEqual(train[:5], sequences.train_seeds(5, (1, 3)))
-
-    def test_environments_accept_the_seeds(self):
-        seeds = sequences.test_seeds(3)
-        found = evaluation.evaluate('plaid/dog_gaps', evaluation.zero, 3, seeds, factory=True)
-        self.assertEqual((found['seeds'], found['seed']), (seeds, None))
-        environments = VectorEnvironment('plaid/dog_gaps', 3, 1, sequences.train_seeds(3))
-        self.assertEqual(environments.seeds.tolist(), sequences.train_seeds(3))
-        with self.assertRaisesRegex(ValueError, '2 seeds for 3 episodes'):
-            evaluation.evaluate('plaid/dog_gaps', evaluation.zero, 3, seeds[:2], factory=True)
 
 
 class MetricsTest(parameterized.TestCase):
@@ -104,15 +103,11 @@ class MetricsTest(parameterized.TestCase):
         scores[2, :2] = 1.0
         self.assertLess(sequences.forgetting(scores), 0)
 
-    def test_scores_whose_metrics_would_be_infinite(self):
-        with self.assertRaisesRegex(
-            ValueError, r'scores: -1e\+308 at \[0, 0\]; expected .* numbers of at most 1e.100'
-        ):
-            sequences.metrics(np.full((3, 3), -1e308), [0.0] * 3)
-        with self.assertRaisesRegex(
-            ValueError, r'initial: 1e\+308 at \[1\]; expected .* of at most 1e.100'
-        ):
-            sequences.metrics(self.SCORES, [0.0, 1e308, 0.0])
+    def test_learning_transfer_is_the_gain_in_mean_over_what_was_missing(self):
+        """The curves have means 0.6 and 0.2 where both are known: (0.6 - 0.2) / (1 - 0.2)."""
+        found = sequences.learning_transfer([0.5, 0.7, None, 0.9], [0.1, 0.3, 0.5, np.nan])
+        self.assertAlmostEqual(found, 0.5)
+        self.assertAlmostEqual(sequences.learning_transfer([0.4, 0.4], [0.5, 0.5]), -0.2)
 
     def test_values_that_are_not_needed_may_be_missing(self):
         scores = np.array(self.SCORES)
@@ -121,27 +116,25 @@ class MetricsTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'not finite'):
             sequences.forward_transfer(scores, self.INITIAL)
 
-    def test_learning_transfer_is_the_gain_in_mean_over_what_was_missing(self):
-        """The curves have means 0.6 and 0.2 where both are known: (0.6 - 0.2) / (1 - 0.2)."""
-        found = sequences.learning_transfer([0.5, 0.7, None, 0.9], [0.1, 0.3, 0.5, np.nan])
-        self.assertAlmostEqual(found, 0.5)
-        self.assertAlmostEqual(sequences.learning_transfer([0.4, 0.4], [0.5, 0.5]), -0.2)
-        with self.assertRaisesRegex(ValueError, r'shape is \(1,\); expected \(2,\)'):
-            sequences.learning_transfer([0.5], [0.1, 0.3])
-        with self.assertRaisesRegex(ValueError, 'no point in common'):
-            sequences.learning_transfer([0.5, None], [None, 0.1])
-        with self.assertRaisesRegex(ValueError, 'expected less than 1'):
-            sequences.learning_transfer([1.0], [1.0])
-
-    @parameterized.parameters((((1, 2, 3), (4, 5, 6)),), (((1,),),), ((1, 2),))
-    def test_a_matrix_that_is_not_square_is_rejected(self, scores):
-        with self.assertRaisesRegex(ValueError, r'expected \(T, T\)'):
-            sequences.average_performance(scores)
-        with self.assertRaisesRegex(ValueError, 'initial: shape'):
-            sequences.forward_transfer(self.SCORES, (0, 0))
+    @parameterized.parameters(
+        ('metrics', np.full((3, 3), -1e308), [0.0] * 3,
+         r'scores: -1e\+308 at \[0, 0\]; expected .* numbers of at most 1e.100'),
+        ('metrics', SCORES, [0.0, 1e308, 0.0], r'initial: 1e\+308 at \[1\]; expected .* of at most 1e.100'),
+        ('average_performance', ((1, 2, 3), (4, 5, 6)), r'expected \(T, T\)'),
+        ('average_performance', ((1,),), r'expected \(T, T\)'),
+        ('average_performance', (1, 2), r'expected \(T, T\)'),
+        ('forward_transfer', SCORES, (0, 0), 'initial: shape'),
+        ('learning_transfer', [0.5], [0.1, 0.3], r'shape is \(1,\); expected \(2,\)'),
+        ('learning_transfer', [0.5, None], [None, 0.1], 'no point in common'),
+        ('learning_transfer', [1.0], [1.0], 'expected less than 1'),
+    )  # fmt: skip
+    def test_invalid_arguments_are_rejected(self, name, *arguments):
+        *arguments, message = arguments
+        with self.assertRaisesRegex(ValueError, message):
+            getattr(sequences, name)(*arguments)
 
 
-class StageTest(parameterized.TestCase):
+class StageTest(absltest.TestCase):
     def stage(self, budget=40, number=1, seed=0):
         return sequences.Stage(SHORT, number, budget, seed, 1)
 
@@ -192,15 +185,15 @@ class StageTest(parameterized.TestCase):
         self.assertEqual(environments.seeds.tolist(), list(drawn[0]))
         environments.reset(seed=5)
         self.assertEqual(environments.seeds.tolist(), sequences.train_seeds(3, 5))
-        for seeds in ([1, 2, 2**31], sequences.test_seeds(3)):
-            with self.assertRaisesRegex(ValueError, 'is for tests; expected training seeds'):
-                environments.seed(seeds)
-        with self.assertRaisesRegex(ValueError, 'seed is None'):
-            environments.seed(None)
-        with self.assertRaisesRegex(ValueError, 'seed: expected none'):
-            self.stage().environments(3, seed=1)
-        with self.assertRaisesRegex(ValueError, "of the run 'PD_Dog2D_Walls_Terrain-v0'"):
-            self.stage().environments(3, 'plaid/dog_walls')
+        make, for_tests = self.stage().environments, 'is for tests; expected training seeds'
+        assert_refused(
+            self,
+            (lambda: environments.seed([1, 2, 2**31]), for_tests),
+            (lambda: environments.seed(sequences.test_seeds(3)), for_tests),
+            (lambda: environments.seed(None), 'seed is None'),
+            (lambda: make(3, seed=1), 'seed: expected none'),
+            (lambda: make(3, 'plaid/dog_walls'), "of the run 'PD_Dog2D_Walls_Terrain-v0'"),
+        )
 
     def test_curve(self):
         """Ten episodes of two steps fill the first half of the budget."""
@@ -225,7 +218,7 @@ class StageTest(parameterized.TestCase):
 
 
 class Counter:
-    """A learner that remembers where it was, and whose scores are made up."""
+    """A learner that counts its stages, each of which takes 5 samples; it cannot be resumed."""
 
     def __init__(self, stop_at=None):
         self.history, self.stop_at = [], stop_at
@@ -233,8 +226,8 @@ class Counter:
     def train(self, stage):
         if len(self.history) == self.stop_at:
             raise KeyboardInterrupt
-        self.history.append((stage.id, stage.budget, stage.seed))
-        stage.spend(stage.number, 5)
+        self.history.append([stage.id, stage.budget, stage.seed])
+        stage.spend(stage.ids.index(stage.id), 5)
 
     def policy(self):
         return len(self.history)
@@ -245,56 +238,72 @@ class Keeper(Counter):
         (folder / 'history.json').write_text(json.dumps(self.history))
 
     def load(self, folder):
-        self.history = [tuple(row) for row in json.loads((folder / 'history.json').read_text())]
+        self.history = json.loads((folder / 'history.json').read_text())
 
 
 def made_up(cases, episodes, seeds, threads, executor):
+    """Scores instead of those of `evaluation.evaluate_all`: 0.04 more after every stage."""
     assert min(seeds) >= 2**31 and len(seeds) == episodes
     for spec, stages in cases:
-        yield {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(spec.id)}
+        place = SHORT.ids.index(spec.id) if spec.id in SHORT.ids else 0
+        yield {'normalized_return': 0.04 * stages + 0.01 * place}
 
 
-class RunTest(parameterized.TestCase):
+class RunCase(FolderTest):
     def setUp(self):
         super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.path = self.folder / 'result.json'
         self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
         self.enterContext(mock.patch.object(running.time, 'perf_counter', lambda: 0.0))
 
-    def run_short(self, learner, **changes):
-        return sequences.run(SHORT, learner, **{'budget': 7, 'path': self.path, **changes})
+    def run_short(self, learner, which=SEQUENCES, **changes):
+        of, course, budget = which
+        return of.run(course, learner, **{'budget': budget, 'path': self.path, **changes})
 
-    def test_stages(self):
+
+class RunTest(RunCase):
+    def test_stages_of_a_sequence(self):
         learner = Counter()
         result = self.run_short(learner, seed=3)
-        self.assertEqual(learner.history, [(id_, 7, 3) for id_ in SHORT.ids])
+        self.assertEqual(learner.history, [[id_, 7, 3] for id_ in SHORT.ids])
         np.testing.assert_allclose(result['initial'], [0, 0.01, 0.02])
-        np.testing.assert_allclose(result['scores'], np.add.outer([0.1, 0.2, 0.3], [0, 0.01, 0.02]))
+        np.testing.assert_allclose(
+            result['scores'], np.add.outer([0.04, 0.08, 0.12], [0, 0.01, 0.02])
+        )
         self.assertEqual(result['samples'], [[5, 0, 0], [0, 5, 0], [0, 0, 5]])
-        self.assertAlmostEqual(result['metrics']['forgetting'], -0.1)
-        self.assertAlmostEqual(result['metrics']['forward_transfer'], 0.15)
+        self.assertAlmostEqual(result['metrics']['forgetting'], -0.04)
+        self.assertAlmostEqual(result['metrics']['forward_transfer'], 0.06)
         self.assertRegex(result['learner'], 'sequences_test:Counter$')
         self.assertEqual(sequences.read(self.path), result)
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+        self.assert_only('result.json')
         # A finished result needs no learning.
         self.assertEqual(self.run_short(Counter(stop_at=0), seed=3), result)
 
-    @parameterized.parameters(0, 1, 2)
-    def test_a_stopped_run_resumes(self, stop_at):
-        whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
+    def test_parts_of_the_benchmark(self):
+        """Of 10 samples each; what is left of one is for the next."""
+        learner = Counter()
+        result = self.run_short(learner, BENCHMARK)
+        self.assertEqual(learner.history, [[ID, 10 + 5 * i, 0] for i in range(20)])
+        self.assertEqual(result['samples'], [[5]] * 20)
+        last, mean = (benchmark.normalised(ID, score) for score in (0.8, 0.04 * 10.5))
+        self.assertAlmostEqual(result['metrics']['score'], last)
+        self.assertAlmostEqual(result['metrics']['mean_score'], mean)
+        self.assertEqual(benchmark.read(self.path), result)
+        self.assert_only('result.json')
+
+    @parameterized.parameters(*((SEQUENCES, i) for i in (0, 1, 2)), (BENCHMARK, 0), (BENCHMARK, 13))
+    def test_a_stopped_run_resumes(self, which, stop_at):
+        whole = self.run_short(Keeper(), which, path=self.folder / 'whole.json')
         with self.assertRaises(KeyboardInterrupt):
-            self.run_short(Keeper(stop_at))
+            self.run_short(Keeper(stop_at), which)
         with self.assertRaisesRegex(ValueError, 'metrics is missing; the run has not ended'):
-            sequences.read(self.path)
-        names = {path.name for path in self.folder.iterdir()} - {'whole.json', 'result.json'}
-        self.assertEqual(names, {f'result.stage{stop_at}'} if stop_at else set())
+            which[0].read(self.path)
+        state = [f'result.stage{stop_at}'] if stop_at else []
+        self.assert_only('whole.json', 'result.json', *state)
         learner = Keeper()
-        self.assertEqual(self.run_short(learner), whole)
-        self.assertLen(learner.history, 3)
-        self.assertCountEqual(
-            [path.name for path in self.folder.iterdir()], ['whole.json', 'result.json']
-        )
+        self.assertEqual(self.run_short(learner, which), whole)
+        self.assertLen(learner.history, len(whole['scores']))
+        self.assert_only('whole.json', 'result.json')
 
     def test_a_run_that_resumes_on_another_machine(self):
         def made(mujoco, cpu):
@@ -302,6 +311,8 @@ class RunTest(parameterized.TestCase):
 
         with made('3.17.0', 'x86_64 AVX2'):
             part = self.run_short(Keeper(), stages=1)
+        self.assertLen(part['scores'], 1)
+        self.assertNotIn('metrics', part)
         self.assertEqual((part['mujoco'], part['cpu']), ('3.17.0', 'x86_64 AVX2'))
         with (
             made('3.18.0', 'x86_64 AVX2'),
@@ -315,26 +326,14 @@ class RunTest(parameterized.TestCase):
         with made('3.17.0', 'arm64'):  # a finished result is left alone
             self.assertEqual(self.run_short(Keeper()), result)
 
-    def test_a_run_in_parts(self):
-        whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
-        part = self.run_short(Keeper(), stages=2)
-        self.assertEqual(part['scores'], whole['scores'][:2])
-        self.assertNotIn('metrics', part)
-        self.assertEqual(self.run_short(Keeper()), whole)
-        with self.assertRaisesRegex(ValueError, 'stages is 4; expected a whole number from 1 to 3'):
-            self.run_short(Keeper(), stages=4)
-
     def test_a_failed_save_leaves_the_stage_before(self):
-        learner = Keeper()
         with (
             mock.patch.object(Keeper, 'save', side_effect=[None, OSError('full')]),
             self.assertRaisesRegex(OSError, 'full'),
         ):
-            self.run_short(learner)
+            self.run_short(Keeper())
         self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
-        self.assertCountEqual(
-            [path.name for path in self.folder.iterdir()], ['result.json', 'result.stage1']
-        )
+        self.assert_only('result.json', 'result.stage1')
 
     def test_two_runs_that_write_one_result(self):
         """The second one is refused as long as the first one lasts."""
@@ -345,15 +344,16 @@ class RunTest(parameterized.TestCase):
         ):
             self.run_short(Keeper())
         self.assertLen(self.run_short(Keeper())['scores'], 3)
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+        self.assert_only('result.json')
 
-    def test_folders_of_the_user_are_not_removed(self):
-        for name in ('result.stage0', 'result.stage2'):
-            (self.folder / name / 'own').mkdir(parents=True)
-        with self.assertRaisesRegex(FileExistsError, 'result.stage2: exists; remove it, or choose'):
+    @parameterized.parameters('result.stage2', 'result.npz')
+    def test_files_of_the_user_are_not_removed(self, name):
+        for each in ('result.stage0', name):
+            (self.folder / each / 'own').mkdir(parents=True)
+        with self.assertRaisesRegex(FileExistsError, f'{name}: exists; remove it, or choose'):
             self.run_short(Keeper())
         self.assertFalse(self.path.exists())
-        (self.folder / 'result.stage2').rename(self.folder / 'moved')
+        (self.folder / name).rename(self.folder / 'moved')
         self.assertLen(self.run_short(Keeper())['scores'], 3)
         self.assertTrue((self.folder / 'result.stage0' / 'own').exists())
 
@@ -367,55 +367,56 @@ class RunTest(parameterized.TestCase):
         (part / 'history.json').write_text('half')
         (self.folder / '.result.json.lock').write_text('1234')
         self.assertLen(self.run_short(Keeper())['scores'], 3)
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+        self.assert_only('result.json')
         (self.folder / 'result.stage1').mkdir()  # it was killed after its last stage
         self.run_short(Keeper())
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+        self.assert_only('result.json')
 
-    def test_a_learner_that_exceeds_its_budget_is_refused(self):
+    def test_samples_beyond_the_budget_or_after_a_stage_are_refused(self):
         class Greedy(Counter):
             def train(self, stage):
                 super().train(stage)
-                if stage.number == 1:
-                    environments = stage.environments(3, num_threads=1)
-                    environments.reset()
-                    environments.step(np.zeros((3, len(environments.action_map))))
+                stage.spend(0, 3 * stage.number)
 
-        with self.assertRaisesRegex(sequences.BudgetExceededError, '3 more samples.* at most 2'):
-            self.run_short(Greedy())
-        self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
-
-    def test_no_samples_after_a_stage(self):
         class Late(Counter):
             def train(self, stage):
+                super().train(stage)
                 self.stage = stage
 
             def policy(self):
-                if hasattr(self, 'stage'):
+                if len(self.history) == 2:
                     self.stage.spend(0, 1)
-                return 0
+                return super().policy()
 
-        with self.assertRaisesRegex(sequences.BudgetExceededError, 'steps in train only'):
-            self.run_short(Late())
+        for kind, message in (
+            (Greedy, '3 more samples.* at most 2'),
+            (Late, 'steps in train only'),
+        ):
+            with self.assertRaisesRegex(sequences.BudgetExceededError, message):
+                self.run_short(kind())
+            self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
+            self.path.unlink()
 
     def test_invalid_arguments_are_rejected(self):
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Counter(stop_at=1))
-        with self.assertRaisesRegex(ValueError, '1 of 3 stages, and a Counter cannot resume'):
-            self.run_short(Counter())
-        with self.assertRaisesRegex(ValueError, 'another budget: 7; expected 8'):
-            self.run_short(Counter(), budget=8)
-        with self.assertRaisesRegex(ValueError, 'another learner: .*Counter; expected .*Keeper'):
-            self.run_short(Keeper())
-        with self.assertRaisesRegex(ValueError, 'budget is 0'):
-            self.run_short(Counter(), budget=0)
-        with self.assertRaisesRegex(ValueError, "'.txt'"):
-            self.run_short(Counter(), path=self.folder / 'result.txt')
+
+        def run(learner, **changes):
+            return lambda: self.run_short(learner, **changes)
+
+        assert_refused(
+            self,
+            (run(Counter()), '1 of 3 stages, and a Counter cannot resume'),
+            (run(Counter(), budget=8), 'another budget: 7; expected 8'),
+            (run(Keeper()), 'another learner: .*Counter; expected .*Keeper'),
+            (run(Counter(), budget=0), 'budget is 0'),
+            (run(Counter(), stages=4), 'stages is 4; expected a whole number from 1 to 3'),
+            (run(Counter(), path=self.folder / 'result.txt'), "'.txt'"),
+        )
         with self.assertRaisesRegex(TypeError, 'expected the methods train and policy'):
             self.run_short(object())
         self.path.write_text('{"scores": 3}')
-        with self.assertRaisesRegex(ValueError, 'result.json: format is missing'):
-            self.run_short(Counter())
+        assert_refused(self, (run(Counter()), 'result.json: format is missing'))
 
 
 class ExecutorTest(absltest.TestCase):
@@ -432,29 +433,23 @@ class ExecutorTest(absltest.TestCase):
             self.assertEqual(sequences.scores(SHORT, still, 4, 1, executor=pool), expected)
 
 
-def put(result, name, value):
-    """Changes an entry, such as 'scores[1][2]'."""
+def changed(result, name, value):
+    """Returns a copy with another value of an entry, such as 'scores[1][2]', and its digest."""
     *path, last = (
         int(p) if p.isdigit() else p for p in name.replace('[', '.').replace(']', '').split('.')
     )
-    for part in path:
-        result = result[part]
-    result[last] = value
+    result = copy.deepcopy(result)
+    part = result
+    for each in path:
+        part = part[each]
+    part[last] = value
+    return {**result, 'digest': results.digest(result)}
 
 
-class ResultTest(parameterized.TestCase):
+class ResultTest(RunCase):
     def setUp(self):
         super().setUp()
-        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
-        with mock.patch.object(evaluation, 'evaluate_all', made_up):
-            self.result = sequences.run(SHORT, Counter(), 7, 'result.json')
-
-    def changed(self, name, value, digest=True):
-        result = copy.deepcopy(self.result)
-        put(result, name, value)
-        if digest:
-            result['digest'] = results.digest(result)
-        return result
+        self.result = self.run_short(Counter())
 
     @parameterized.parameters(
         ('format', 'other', "format is 'other'; expected 'trl_suite sequence 1'"),
@@ -470,19 +465,34 @@ class ResultTest(parameterized.TestCase):
         ('scores[1][2]', 'high', r"scores\[1\]\[2\] is 'high'; expected a number"),
         ('scores[1][2]', float('nan'), r'scores\[1\]\[2\] is nan; expected a number'),
         ('scores[1][2]', 1.01, r'scores\[1\]\[2\] is 1.01; expected a number at most 1'),
-        ('scores[2][1]', 0.9, r'metrics.average_performance is 0.31.*; expected 0.50'),
+        ('scores[2][1]', 0.9, r'metrics.average_performance is 0.1[23].*; expected 0.38'),
         ('samples[1][1]', 8, r'samples\[1\] is \[0, 8, 0\], in total 8; .* at most 7'),
         ('samples[1][1]', 2.5, r'samples\[1\].*expected whole numbers'),
         ('samples[1][1]', -1, r'samples\[1\]\[1\] is -1; .* at least 0'),
         ('curves[0]', [], r'curves\[0\]: 0 entries; expected 20 numbers'),
         ('seconds', [1], 'seconds: 1 stages; expected 3'),
         ('metrics', {}, 'metrics: expected average_performance'),
-        ('metrics.forgetting', -0.2, 'metrics.forgetting is -0.2; expected -0.1'),
+        ('metrics.forgetting', -0.2, 'metrics.forgetting is -0.2; expected -0.0(4|39)'),
         ('metrcs', 1, "unknown field 'metrcs'; did you mean 'metrics'"),
+        *((name, 4, f'{name} is 4; expected a string') for name in (*results.MADE_WITH, 'policy')),
     )  # fmt: skip
     def test_errors_name_the_field_and_what_was_expected(self, name, value, message):
         with self.assertRaisesRegex(ValueError, message):
-            sequences.check(self.changed(name, value))
+            sequences.check(changed(self.result, name, value))
+
+    @parameterized.parameters(
+        ('format', 'trl_suite benchmark 0', "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'"),
+        ('environment', 'PD_Dog2D_Flat_Terrain-v0', "unknown environment of the core set 'PD_Dog2D_Flat"),
+        ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps"),
+        ('samples[19]', [106], r'samples\[19\] is \[106\], in total 106; .* at most 105'),
+        ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20'),
+        ('metrics', {'score': 0.9, 'mean_score': 0.42}, r'metrics.score is 0.9; expected'),
+    )  # fmt: skip
+    def test_errors_in_results_of_the_benchmark(self, name, value, message):
+        self.path.unlink()
+        result = self.run_short(Counter(), BENCHMARK)
+        with self.assertRaisesRegex(ValueError, message):
+            benchmark.check(changed(result, name, value))
 
     @parameterized.parameters(
         'learner', 'trl_suite', 'seed', 'episodes', 'scores[0][2]', 'samples[0][1]', 'seconds[1]'
@@ -491,24 +501,24 @@ class ResultTest(parameterized.TestCase):
         """Also of entries that no metric uses."""
         sequences.check(self.result)
         value = 'other' if name in ('learner', 'trl_suite') else 1
+        edited = {**changed(self.result, name, value), 'digest': self.result['digest']}
         with self.assertRaisesRegex(ValueError, 'digest is .* changed after the run'):
-            sequences.check(self.changed(name, value, digest=False))
+            sequences.check(edited)
 
     def test_what_it_was_made_with_may_be_missing(self):
         self.assertEqual(
             {name: self.result[name] for name in results.MADE_WITH}, machine.made_with()
         )
         for name in results.MADE_WITH:
-            with self.assertRaisesRegex(ValueError, f'{name} is 4; expected a string'):
-                sequences.check(self.changed(name, 4))
             del self.result[name]
-        sequences.check(self.changed('seed', 0))
+        sequences.check(changed(self.result, 'seed', 0))
 
     def test_missing_fields(self):
-        for name in (*sequences.BENCHMARK.fields, 'metrics'):
+        def without(name):
             result = {key: value for key, value in self.result.items() if key != name}
-            with self.assertRaisesRegex(ValueError, f'^{name} is missing'):
-                sequences.check(result)
+            return lambda: sequences.check(result), f'^{name} is missing'
+
+        assert_refused(self, *map(without, (*sequences.BENCHMARK.fields, 'metrics')))
         for other in (3, [], None):
             with self.assertRaisesRegex(ValueError, 'expected an object with format'):
                 sequences.check(other)
@@ -521,93 +531,115 @@ class ResultTest(parameterized.TestCase):
         same = {**self.result, 'sequence': 'plaid_dog', 'budget': 100_000}
         self.assertEqual(sequences.departures(same), [])
         self.assertEqual(sequences.departures({**same, 'seed': 3}), ['seed is 3, not 0 or 1 or 2'])
+        result = {'environment': ID, 'budget': 200, 'episodes': 4, 'seed': 7}
+        self.assertEqual(benchmark.departures(result), [
+            'budget is 200, not 1000000 or 10000000', 'episodes is 4, not 32',
+            'seed is 7, not 0 or 1 or 2 or 3 or 4',
+        ])  # fmt: skip
 
 
 MODULE = """
 import numpy as np
 
 class Nothing:
-    def __init__(self, sequence, seed):
+    def __init__(self, course, seed):
         self.size = 11
 
     def train(self, stage):
-        environments = stage.environments(4)
+        self.step(stage.environments(2))
+
+    def step(self, environments):
         environments.reset()
-        environments.step(np.zeros((4, self.size)))
+        environments.step(np.zeros((2, self.size)))
 
     def policy(self):
         return lambda observation: np.zeros((len(observation), self.size))
+
+class Greedy(Nothing):
+    def train(self, stage):
+        while True:
+            self.step(stage.environments(2))
 """
 
 
-class CommandTest(cli_test.CommandTest):
-    def test_run_and_check(self):
+class LearnerTest(CommandTest):
+    """The commands `sequences` and `benchmark`."""
+
+    def setUp(self):
+        super().setUp()
         pathlib.Path('my_learner.py').write_text(MODULE)
-        self.addCleanup(setattr, sys, 'path', list(sys.path))
-        arguments = (
-            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothing', '--budget', '1e2',
-            '--episodes', '1', '--threads', '1',
+        self.enterContext(
+            mock.patch.object(
+                evaluation, 'evaluate_all',
+                lambda cases, *_, executor: [{'normalized_return': 0.5} for _ in cases],
+            )
         )  # fmt: skip
-        out = self.output(*arguments)
-        self.assertRegex(out, r'after PD_Biped2D_Gaps_Terrain-v0 +(0\.\d{3} ?){5}')
-        self.assertRegex(out, r'forgetting +0.000')
-        result = sequences.read('result.json')
-        self.assertEqual((result['budget'], result['learner']), (100, 'my_learner:Nothing'))
-        self.assertEqual(np.trace(result['samples']), np.sum(result['samples']))
-        self.assertEqual(np.sum(result['samples']), 5 * 4)
-        out = self.output('sequences', 'check', 'result.json')
+
+    @parameterized.parameters(
+        ('sequences', 'plaid_biped', '100', 'result.json', sequences.BENCHMARK, 10, '100 of 100',
+         r'after PD_Biped2D_Gaps_Terrain-v0 +(0\.500 ?){5}\n(.*\n)*forgetting +0.000'),
+        ('benchmark', ID, '60', f'Nothing/{ID}_s0.json', benchmark.BENCHMARK, 40, '2 of 3',
+         rf'^Nothing/{ID}_s0.json: score 0\.\d\d\d\n$'),
+    )  # fmt: skip
+    def test_run_and_check(self, command, name, budget, path, of, samples, taken, out):
+        run = (command, 'run', name, '--budget', budget, '--episodes', '1', '--threads', '1',
+               '--learner')  # fmt: skip
+        self.assertRegex(self.output(*run, 'my_learner:Nothing'), out)
+        result = of.read(path)
+        self.assertEqual((result['budget'], result['learner']), (int(budget), 'my_learner:Nothing'))
+        self.assertEqual(np.sum(result['samples']), samples)
         made = f'mujoco {result["mujoco"]}, cpu {result["cpu"]}'
         self.assertRegex(
-            out, f'my_learner:Nothing, plaid_biped.*, {made}: not comparable: budget is 100, not'
+            self.output(command, 'check', path),
+            f'{path}: my_learner:Nothing, {name}, .*{made}: not comparable: budget is {budget}, not',
         )
-        result['learner'] = '\x1b]0;title\x07a\nvalid and comparable'
-        result['digest'] = results.digest(result)
-        pathlib.Path('forged.json').write_text(json.dumps(result))
-        out = self.output('sequences', 'check', 'forged.json')
-        self.assertStartsWith(out, r'forged.json: \x1b]0;title\x07a\nvalid and comparable, plaid')
-        self.assertEqual(out.count('\n'), 1)
-        text = pathlib.Path('result.json').read_text()
-        pathlib.Path('edited.json').write_text(text.replace('"budget": 100', '"budget": 101'))
-        self.assert_refused(
-            'edited.json: digest is .* the file was changed', 'sequences', 'check', 'edited.json'
+        forged = changed(result, 'learner', '\x1b]0;title\x07a\nvalid and comparable')
+        pathlib.Path('forged.json').write_text(json.dumps(forged))
+        told = self.output(command, 'check', 'forged.json')
+        self.assertStartsWith(
+            told, rf'forged.json: \x1b]0;title\x07a\nvalid and comparable, {name}'
         )
+        self.assertEqual(told.count('\n'), 1)
+        text = pathlib.Path(path).read_text().replace(f'"budget": {budget}', '"budget": 101')
+        pathlib.Path('edited.json').write_text(text)
         self.assert_refused(
-            "unknown learner of the module my_learner: 'Nothin'; did you mean 'Nothing'",
-            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothin',
-        )  # fmt: skip
-        for other in ('.a:C', 'a..b:C', 'a b:C'):
-            self.assert_refused(
-                f"--learner is '{other}'; expected module:Class", 'sequences', 'run', 'plaid_biped',
-                '--learner', other,
-            )  # fmt: skip
-        for other in ('os:path', 'pathlib:Path'):
-            self.assert_refused(
-                f"--learner is '{other}', which has no train and policy; expected a class",
-                'sequences', 'run', 'plaid_biped', '--learner', other,
-            )  # fmt: skip
+            'edited.json: digest is .*the file was', command, 'check', 'edited.json'
+        )
+        pathlib.Path(path).unlink()
         self.assert_refused(
-            "'my_learner'; expected module:Class",
-            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner',
-        )  # fmt: skip
-        self.assert_refused(
-            "--budget is 'tiny'; expected small, full or a number",
-            *arguments[:5],
-            '--budget',
-            'tiny',
+            rf'stage 0 \(.*2 more samples; .* at most .*{taken} are', *run, 'my_learner:Greedy'
         )
 
     def test_list(self):
         out = self.output('sequences', 'list')
         for name in sequences.SEQUENCES:
             self.assertIn(f'{name} ', out)
+        out = self.output('benchmark', 'list')
+        for id_, course in benchmark.CORE.items():
+            self.assertRegex(out, rf'{id_} +0\.\d+ +0\.\d+ +\d+  {course.description}')
+
+    @parameterized.product(
+        command=(('sequences', 'run', 'plaid_biped'), ('benchmark', 'run', ID)),
+        refused=(
+            ("unknown learner of the module my_learner: 'Nothin'; did you mean 'Nothing'", 'my_learner:Nothin'),
+            *((f"--learner is '{name}'; expected module:Class", name)
+              for name in ('my_learner', '.a:C', 'a..b:C', 'a b:C')),
+            *((f"--learner is '{name}', which has no train and policy; expected a class", name)
+              for name in ('os:path', 'pathlib:Path')),
+            ("--budget is 'tiny'; expected .* or a number", 'my_learner:Nothing', '--budget', 'tiny'),
+        ),
+    )  # fmt: skip
+    def test_bad_learners_are_refused(self, command, refused):
+        message, *arguments = refused
+        self.assert_refused(message, *command, '--learner', *arguments)
 
 
-class BaselinesTest(parameterized.TestCase):
+class BaselinesTest(FolderTest):
     """With small networks, in which every stage makes some updates."""
 
     def setUp(self):
         super().setUp()
-        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
+        self.enterContext(contextlib.chdir(self.folder))
         self.enterContext(mock.patch.object(continual, 'NUM_ENVS', 8))
         settings = continual.settings.settings_for
         small = {'hidden': (16, 16), 'minibatch': 128, 'cloning_epochs': 2}
