@@ -6,20 +6,18 @@ import pathlib
 import re
 from unittest import mock
 
-import cli_test
 import numpy as np
 import own_test
 from absl.testing import absltest, parameterized
 from PIL import Image
+from programs import GAPS, CommandTest, run
 
 from trl_suite import motion, policies, suite
 from trl_suite.cli import bench, doctor
 from trl_suite.environments import named_policies as acting
 from trl_suite.util import machine
 
-GAPS = cli_test.GAPS
 SETUP = pathlib.Path(__file__).resolve().parents[1] / 'setup.py'
-CommandTest, run = cli_test.CommandTest, cli_test.run
 
 
 class TryTest(CommandTest):
@@ -41,32 +39,24 @@ class TryTest(CommandTest):
         pathlib.Path('dog.xml').write_text(text)  # a name of the suite's own
         out = self.output(
             'try', 'dog.xml', '--spatial', '--turn', '0.7071', '0', '0', '0.7071', '--end-effectors',
-            'left_shin', '--output', 'a.png',
+            'left_shin', '--fall-links', '--output', 'a.png',
         )  # fmt: skip
         self.assertIn('dog_file: three-dimensional', out)
         self.assertRegex(out, r'facing: along \[-?0.\d*, 1.0\]')
-        self.assertIn('end effectors: left_shin; must', out)
+        self.assertIn('end effectors: left_shin; must not touch the ground: none', out)
         self.assertIn('note: actuators that are left out, 1 of 3, because', out)
-        self.assertTrue(pathlib.Path('a.png').exists())
-
-    def test_a_character_without_fall_links(self):
-        pathlib.Path('figure.xml').write_text(own_test.MJCF)
-        out = self.output('try', 'figure.xml', '--spatial', '--fall-links')
-        self.assertIn('must not touch the ground: none', out)
         self.assertIn('note: --spatial was given and is used', out)
+        self.assertTrue(pathlib.Path('a.png').exists())
 
     def test_a_character_that_diverges(self):
         """The report and the picture are written all the same."""
         spring = 'name="left_knee" stiffness="1e6" springref="90" axis'
-        pathlib.Path('figure.xml').write_text(
-            own_test.MJCF.replace('name="left_knee" axis', spring)
-        )
+        text = own_test.MJCF.replace('name="left_knee" axis', spring)
+        pathlib.Path('figure.xml').write_text(text)
         status, out, err = run('try', 'figure.xml')
         self.assertEqual(status, 2)
         self.assertRegex(out, '(?s)flat: diverges after 0.0.* s of zero actions\n.*try_figure.png')
-        self.assertRegex(
-            err, r'figure.xml: its simulation diverges on flat, slopes, steps; expected a'
-        )
+        self.assertIn('figure.xml: its simulation diverges on flat, slopes, steps; expected a', err)
         self.assertTrue(pathlib.Path('try_figure.png').exists())
 
     def test_messages_name_the_options_of_the_command(self):
@@ -82,14 +72,12 @@ class TryTest(CommandTest):
         pathlib.Path('two.urdf').write_text(own_test.URDF)
         self.assert_refused('pass --spatial or --no-spatial', 'try', 'two.urdf')
         self.assert_refused("no such file; did you mean 'two.urdf'", 'try', 'tow.urdf')
-        self.assert_refused(
-            "unknown root 'leg2'; did you mean 'leg'", 'try', 'two.urdf', '--root', 'leg2'
-        )
+        self.assert_refused("did you mean 'leg'", 'try', 'two.urdf', '--root', 'leg2')
         self.assert_refused("suffix '.jpg'; expected .png", 'try', 'two.urdf', '--output', 'a.jpg')
         size = '<mujoco><size nuser_geom="2000000000"/>'
         pathlib.Path('two.xml').write_text(own_test.MJCF.replace('<mujoco>', size))
         self.assert_refused('two.xml: .*; expected what can be read in 10 s', 'try', 'two.xml')
-        self.assertEqual({path.name for path in pathlib.Path().iterdir()}, {'two.urdf', 'two.xml'})
+        self.assert_only('two.urdf', 'two.xml')
 
 
 class DoctorTest(CommandTest):
@@ -124,20 +112,15 @@ class DoctorTest(CommandTest):
         # At exit, a partly loaded library may print long messages.
         code = 'import atexit; atexit.register(lambda: print(1 / 0)); import no_such_module'
         status, _, error = doctor._end(doctor._start(code))
-        self.assertEqual(
-            (status, error), (1, "ModuleNotFoundError: No module named 'no_such_module'")
-        )
+        expected = "ModuleNotFoundError: No module named 'no_such_module'"
+        self.assertEqual((status, error), (1, expected))
         with mock.patch.object(doctor, 'TIMEOUT', 0.1):
             status, _, error = doctor._end(doctor._start('import time; time.sleep(60)'))
         self.assertEqual((status, error), (1, 'no answer within 0.1 s'))
 
     @parameterized.parameters(
         ((1, '["9 steps per second"]', 'FatalError: no GL'), ('egl',), 'export MUJOCO_GL=egl'),
-        (
-            (1, '["9 steps per second"]', 'FatalError: no GL'),
-            (),
-            'MUJOCO_GL=disable if you need no',
-        ),
+        ((1, '["9 steps per second"]', 'FatalError: no GL'), (), 'MUJOCO_GL=disable if you need'),
         ((1, '', 'ImportError: mujoco'), (), 'see the failures above'),
     )
     def test_failures_name_a_remedy(self, end, works, remedy):
@@ -271,14 +254,12 @@ class ClipTest(CommandTest):
 
     def test_invalid_maps_are_rejected(self):
         for text, message in (
-            ('[1, 2]', 'map.json: expected an object of names'),
-            ('[1, 2', 'map.json: not JSON'),
+            ('[1, 2]', 'map.json: expected an object of names'), ('[1, 2', 'map.json: not JSON'),
             ('{"left_knee": 3}', 'map.json: expected an object'),
-        ):
+        ):  # fmt: skip
             pathlib.Path('map.json').write_text(text)
-            self.assert_refused(
-                message, 'clip', 'run.json', '--character', 'raptor', '--map', 'map.json'
-            )
+            arguments = 'run.json', '--character', 'raptor', '--map', 'map.json'
+            self.assert_refused(message, 'clip', *arguments)
 
     def test_errors_leave_no_files(self):
         here = [path.name for path in self.folder.iterdir()]

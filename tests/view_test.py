@@ -10,18 +10,17 @@ import urllib.request
 import warnings
 from unittest import mock
 
-import cli_test
 import numpy as np
 from absl.testing import absltest, parameterized
+from programs import GAPS, CommandTest, policy_for, run
 
-from trl_suite import suite
+from trl_suite import policies, suite
 from trl_suite.cli import view
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.task import Marker
 from trl_suite.util import notices
 from trl_suite.viewing import browser, playback
 
-GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
 HILLS = 'PD_Biped3D_Imitate-Hills_Terrain-v0'
 FRAME = 1 / 30  # s
@@ -31,7 +30,7 @@ with warnings.catch_warnings():  # GLFW's, where there is no screen
     window = importlib.import_module('trl_suite.viewing.window')
 
 
-class CommandTest(cli_test.CommandTest):
+class ViewTest(CommandTest):
     def view(self, *arguments):
         """Runs the command; returns environment, policy and title of the window."""
         with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
@@ -54,7 +53,8 @@ class CommandTest(cli_test.CommandTest):
         self.assertEqual(policy(time_step).shape, environment.action_spec().shape)
 
     def test_a_policy_file(self):
-        policy = cli_test.save_policy('mine.npz', GAPS)
+        policy = policy_for(GAPS)
+        policies.save(policy, 'mine.npz')
         environment, found, title = self.view(GAPS, '--policy', 'mine.npz')
         self.assertEqual(title, f'{GAPS}: mine.npz')
         time_step = environment.reset()
@@ -63,7 +63,6 @@ class CommandTest(cli_test.CommandTest):
     @parameterized.parameters(
         ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
         ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
-        ('no such file', GAPS, '--policy', 'none.npz'),
         ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
     )
@@ -87,9 +86,8 @@ class CommandTest(cli_test.CommandTest):
             os.kill(os.getpid(), number)
 
         with mock.patch.object(browser.Browser, '_serve', serve):
-            found, out, err = cli_test.run(
-                'view', GAPS, '--browser', '--port', '18700', '--policy', 'zero'
-            )
+            words = 'view', GAPS, '--browser', '--port', '18700', '--policy', 'zero'
+            found, out, err = run(*words)
         self.assertEqual((found, err), (status, f'trl-suite: {how}\n'))
         self.assertRegex(out, r'^open http://127.0.0.1:\d+\S* in a web browser; press Ctrl')
         with self.assertRaises(ConnectionRefusedError):
@@ -111,7 +109,7 @@ class CommandTest(cli_test.CommandTest):
 
         before = list(notices.listeners)
         with mock.patch.object(browser.Browser, '_load', load):
-            found, out, _ = cli_test.run('view', GAPS, '--browser', '--port', '18700')
+            found, out, _ = run('view', GAPS, '--browser', '--port', '18700')
         self.assertEqual((found, *seen[:2]), (status, 200, 403))
         self.assertIn(GAPS, seen[2])
         self.assertIn('compiling', seen[4])
@@ -126,13 +124,9 @@ class CommandTest(cli_test.CommandTest):
             self.assert_refused('neither DISPLAY nor WAYLAND_DISPLAY .*--browser', 'view', GAPS)
         with (
             mock.patch.dict('os.environ', {'DISPLAY': ':1', 'MUJOCO_GL': 'egl'}),
-            mock.patch(
-                'glfw.init', lambda: warnings.warn('Failed to open display :1', stacklevel=1)
-            ),
+            mock.patch('glfw.init', lambda: warnings.warn('Failed to open :1', stacklevel=1)),
         ):
-            self.assert_refused(
-                r'GLFW can use \(Failed to open display :1\); .*--browser', 'view', GAPS
-            )
+            self.assert_refused(r'GLFW can use \(Failed to open :1\); .*--browser', 'view', GAPS)
 
 
 class PlaybackTest(parameterized.TestCase):
