@@ -1,18 +1,16 @@
 """Trained policies: what they compute, what they refuse, their files, and those shipped."""
 
-import collections
 import dataclasses
 import io
 import itertools
 import json
-import os
 import pathlib
 import zipfile
 from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import FolderTest
+from helpers import FolderTest, assert_refused
 
 import trl_suite
 from trl_suite import motion, policies, suite
@@ -21,7 +19,7 @@ from trl_suite.registry import catalogue
 from trl_suite.util import resources
 from trl_suite.vector import VectorEnvironment
 
-GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+GAPS, DOG = 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'
 MAX_BYTES = 750_000  # of a shipped network; the largest observes 10 m of ground
 SIZES = (('terrain', 3), ('pose', 4))  # an odd sum: rows lie at any address
 
@@ -109,26 +107,24 @@ def plain(policy, observation):
 
 
 class ActTest(parameterized.TestCase):
-    @parameterized.product(activation=tuple(policies.ACTIVATIONS), hidden=((), (6,), (6, 5)))
-    def test_output_equals_the_documented_formula(self, activation, hidden):
-        policy = make(hidden=hidden, activation=activation)
-        observations = np.random.default_rng(1).normal(0, 2, (50, 7))
+    @parameterized.parameters(
+        *((make, {'activation': a, 'hidden': hidden}, 2.0, 2e-6)
+          for a in policies.ACTIVATIONS for hidden in ((), (6,), (6, 5))),
+        *((make_convolving, {'activation': a, 'layer_norm': norm}, 1.5, 1e-5)
+          for a in policies.ACTIVATIONS for norm in (False, True)),
+        (make_seeing, {}, 1.5, 1e-5),
+        (make_seeing, {'activation': 'relu', 'layer_norm': True}, 1.5, 1e-5),
+    )  # fmt: skip
+    def test_output_equals_the_documented_formula(self, made, changes, scale, atol):
+        policy = made(**changes)
+        observations = np.random.default_rng(1).normal(0, scale, (50, policy.observation_size))
         expected = [plain(policy, row) for row in observations]
         actions = policy(observations)
         self.assertEqual((actions.shape, actions.dtype), ((50, 2), np.float64))
-        np.testing.assert_allclose(actions, expected, atol=2e-6)
-        self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all
-        self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
-
-    @parameterized.parameters(
-        *((make_convolving, a, norm) for a in policies.ACTIVATIONS for norm in (False, True)),
-        (make_seeing, 'tanh', False), (make_seeing, 'relu', True),
-    )  # fmt: skip
-    def test_convolutions(self, made, activation, layer_norm):
-        policy = made(activation=activation, layer_norm=layer_norm)
-        observations = np.random.default_rng(1).normal(0, 1.5, (50, policy.observation_size))
-        expected = [plain(policy, row) for row in observations]
-        np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+        np.testing.assert_allclose(actions, expected, atol=atol)
+        if made is make:
+            self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all
+            self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
 
     @parameterized.parameters(make, make_convolving, make_seeing)
     def test_an_ensemble_has_the_mean_output(self, make_one):
@@ -177,6 +173,7 @@ class ActTest(parameterized.TestCase):
         mirrored = [dataclasses.replace(one, mirror=each) for each in (mirror, twin)]
         self.assertLen(policies.ensemble(mirrored).networks, 2)
         self.assertIs(policies.ensemble([one]), one)
+        bounded = selecting(0, 2, 5)
         for members, message in (
             ([], 'members: .*at least one'),
             ([one, make(clip=2)], 'members: .*different clip'),
@@ -188,20 +185,17 @@ class ActTest(parameterized.TestCase):
             ([line, bare], 'members: .*different convolutions'),
             ([bare, line], 'members: .*different convolutions'),
             ([one, mirrored[0]], 'members: .*different mirrors'),
-            (
-                [selecting(0, 2, 5), dataclasses.replace(selecting(0, 2, 5), largest_change=0.2)],
-                'different largest_change',
-            ),
-        ):
+            ([bounded, dataclasses.replace(bounded, largest_change=0.2)], 'different largest_change'),
+        ):  # fmt: skip
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 policies.ensemble(members)
-        for changes, message in (
-            ({'weights': [*two.weights[:2], one.weights[2]]}, r'weight_2: .*expected \(2, 5, 2\)'),
-            ({'biases': [one.biases[0], *two.biases[1:]]}, r'bias_0: .*expected \(2, 6\)'),
-            ({'weights': [w[:0] for w in two.weights]}, 'weight_0: .*at least one network'),
-            ({'convolution': line.convolution}, r'line: convolutions of 1 .* those of 2'),
-        ):
-            both = policies.ensemble([line, line]) if 'convolution' in changes else two
+        for both, changes, message in (
+            (two, {'weights': [*two.weights[:2], one.weights[2]]}, r'weight_2: .*expected \(2, 5, 2\)'),
+            (two, {'biases': [one.biases[0], *two.biases[1:]]}, r'bias_0: .*expected \(2, 6\)'),
+            (two, {'weights': [w[:0] for w in two.weights]}, 'weight_0: .*at least one network'),
+            (policies.ensemble([line, line]), {'convolution': line.convolution},
+             r'line: convolutions of 1 .* those of 2'),
+        ):  # fmt: skip
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 dataclasses.replace(both, **changes)
 
@@ -238,13 +232,11 @@ class ActTest(parameterized.TestCase):
         policy = make()
         flat = np.random.default_rng(3).normal(size=(4, 7))
         for observation in (flat, flat[0]):
-            mixed = collections.OrderedDict(
-                pose=observation[..., 3:], other=np.zeros(9), terrain=observation[..., :3]
-            )
+            pose, terrain = observation[..., 3:], observation[..., :3]
+            mixed = {'pose': pose, 'other': np.zeros(9), 'terrain': terrain}
             np.testing.assert_array_equal(policy(mixed), policy(observation))
-            np.testing.assert_array_equal(
-                policy({'observations': observation}), policy(observation)
-            )
+            flattened = {'observations': observation}
+            np.testing.assert_array_equal(policy(flattened), policy(observation))
         self.assertEqual(policy(flat[0]).shape, (2,))
         self.assertEqual(policy(np.zeros((0, 7))).shape, (0, 2))
 
@@ -255,14 +247,12 @@ class ActTest(parameterized.TestCase):
         (0.0, r'shape \(\); expected'),
         ({'pose': np.zeros(4)}, 'lacks terrain; expected terrain 3, pose 4'),
         ({}, 'lacks terrain, pose; expected'),
-        (
-            {'terrain': np.zeros(3), 'pose': np.zeros(5)},
-            r"block 'pose' has shape \(5,\); expected \(4,\) or \(n, 4\)",
-        ),
+        ({'terrain': np.zeros(3), 'pose': np.zeros(5)},
+         r"block 'pose' has shape \(5,\); expected \(4,\) or \(n, 4\)"),
         ({'terrain': np.zeros((2, 3)), 'pose': np.zeros((3, 4))}, r"'pose' has shape \(3, 4\)"),
         ({'terrain': np.zeros((2, 3)), 'pose': np.zeros(4)}, r"'pose' has shape \(4,\)"),
         ({'observations': np.zeros(6)}, r'shape \(6,\); expected \(7,\)'),
-    )
+    )  # fmt: skip
     def test_other_observations_are_rejected(self, observation, message):
         with self.assertRaisesRegex(ValueError, message):
             make()(observation)
@@ -293,9 +283,8 @@ class ActTest(parameterized.TestCase):
             mean=np.zeros(2), std=np.ones(2), choices=choices,
         )  # fmt: skip
         seen = np.array([[1.0, 0.5], [0.5, 1.0]])
-        np.testing.assert_allclose(
-            policy(seen), [[0.7, -0.4], [1.0, -0.3]], atol=1e-6
-        )  # 1.3 is clipped
+        expected = [[0.7, -0.4], [1.0, -0.3]]  # 1.3 is clipped
+        np.testing.assert_allclose(policy(seen), expected, atol=1e-6)
         bounded = dataclasses.replace(policy, largest_change=0.25)
         expected = choices + 0.25 * np.tanh([[0.2, 0.1], [0.4, -0.3]])
         np.testing.assert_allclose(bounded(seen), np.minimum(expected, 1), atol=1e-6)
@@ -306,13 +295,7 @@ class ActTest(parameterized.TestCase):
 
     def test_columns_and_cartesian_inputs(self):
         """Near ones where they are, far ones as a direction; columns count with them."""
-        some = {
-            'mean': np.zeros(2),
-            'std': np.ones(2),
-            'clip': 9,
-            'hidden': (),
-            'biases': [np.zeros(2)],
-        }
+        some = {'mean': np.zeros(2), 'std': np.ones(2), 'clip': 9, 'hidden': (), 'biases': [[0, 0]]}
         policy = make(columns=np.array([4, 1]), weights=[np.eye(2) / 10], **some)
         np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
         policy = make(
@@ -369,40 +352,22 @@ class ActTest(parameterized.TestCase):
         ({'choices': np.zeros((2, 3))}, r'choices: has shape \(2, 3\); expected \(2, 2\)'),
         ({'choices': np.full((2, 2), 1.5)}, r'choices: expected at least one action, in \[-1, 1'),
         ({'largest_change': 0.3}, 'largest_change: expected choices, and outputs that change them'),
-        (
-            {'choices': np.zeros((2, 2)), 'largest_change': 0.3},
-            'largest_change: expected choices, and outputs that change them',
-        ),
+        ({'choices': np.zeros((2, 2)), 'largest_change': 0.3},
+         'largest_change: expected choices, and outputs that change them'),
         ({'largest_change': 0.0}, 'largest_change: expected a positive number; got 0.0'),
         ({'largest_change': [0.3]}, r'largest_change: has shape \(1,\); expected \(\)'),
-    )
+    )  # fmt: skip
     def test_malformed_fields_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):
             make(**changes)
 
     @parameterized.parameters(
         (make_convolving, {'strides': ()}, 'strides: 0 layers with 2 weights and 2 biases'),
-        (
-            make_convolving,
-            {'strides': (2, 0)},
-            'filter_1: 5 of width 2 and stride 0 on 4 positions',
-        ),
+        (make_convolving, {'strides': (2, 0)}, 'filter_1: 5 of width 2 and stride 0 on 4 positions'),
         (make_convolving, {'line': 2}, 'filter_0: 4 of width 3 and stride 2 on 2 positions'),
-        (
-            make_convolving,
-            {'weights': [np.zeros((3, 1, 4)), np.zeros((2, 3, 5))]},
-            'filter_1: has sh',
-        ),
-        (
-            make_convolving,
-            {'weights': [np.zeros((3, 4)), np.zeros((2, 4, 5))]},
-            'filter_0: has shape',
-        ),
-        (
-            make_convolving,
-            {'biases': [np.zeros(4), np.zeros(4)]},
-            r'filter_bias_1: .* expected \(5,',
-        ),
+        (make_convolving, {'weights': [np.zeros((3, 1, 4)), np.zeros((2, 3, 5))]}, 'filter_1: has sh'),
+        (make_convolving, {'weights': [np.zeros((3, 4)), np.zeros((2, 4, 5))]}, 'filter_0: has shape'),
+        (make_convolving, {'biases': [np.zeros(4), np.zeros(4)]}, r'filter_bias_1: .* expected \(5,'),
         (make_convolving, {'origin': 13}, 'origin: is 13; expected a number of 0 to 12'),
         (make_convolving, {'line': 14}, 'line: has 14 of 13 inputs'),
         (make_convolving, {'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
@@ -411,7 +376,7 @@ class ActTest(parameterized.TestCase):
         (make_seeing, {'grid': (0, 6)}, r'grid: \(0, 6\) does not divide'),
         (make_seeing, {'grid': (5, 12)}, r'filter_0: has shape .*; expected \(2, 3, 1, 4\)'),
         (make_seeing, {'grid': (30, 1)}, r'filter_0: 4 of width 2 x 3 and stride 2 on 30 x 1 pos'),
-    )
+    )  # fmt: skip
     def test_malformed_convolutions_are_rejected(self, made, changes, message):
         policy = made()
         with self.assertRaisesRegex(ValueError, message):
@@ -439,16 +404,11 @@ class CheckTest(absltest.TestCase):
         for fields, message in (
             ({'blocks': blocks[1:]}, 'observes pose .*gives terrain 50, pose'),
             ({'blocks': [*blocks[1:], blocks[0]]}, 'observes pose .*gives terrain 50, pose'),
-            (
-                {'blocks': [('terrain', 49), *blocks[1:]]},
-                'observes terrain 49, .*gives terrain 50, ',
-            ),
-            (
-                {'actions': [*names[1:], names[0]]},
-                f'sets .* of {names[1]}, .*takes .* of {names[0]}, ',
-            ),
+            ({'blocks': [('terrain', 49), *blocks[1:]]}, 'observes terrain 49, .*gives terrain 50, '),
+            ({'actions': [*names[1:], names[0]]},
+             f'sets .* of {names[1]}, .*takes .* of {names[0]}, '),
             ({'quantity': 'torque'}, 'sets the torque of .*takes the target angle of'),
-        ):
+        ):  # fmt: skip
             with self.assertRaisesRegex(ValueError, message):
                 make(**{'blocks': blocks, 'actions': names, **fields}).check(environment)
 
@@ -513,9 +473,8 @@ class FileTest(FolderTest):
             self.assertEqual(data['weight_0'].dtype, np.float16)
             self.assertEqual(data['bias_0'].dtype, np.float32)
         for name in ('weights', 'biases'):
-            for array, expected in zip(
-                getattr(policies.load(path), name), getattr(policy, name), strict=True
-            ):
+            ours, theirs = (getattr(each, name) for each in (policies.load(path), policy))
+            for array, expected in zip(ours, theirs, strict=True):
                 self.assertEqual(array.dtype, np.float32)
                 np.testing.assert_array_equal(array, expected)
 
@@ -529,7 +488,7 @@ class FileTest(FolderTest):
         ):
             policies.save(make(1), path)
         self.assertEqual(path.read_bytes(), before)
-        self.assertEqual(os.listdir(self.folder), ['p.npz'])
+        self.assert_only('p.npz')
         with self.assertRaisesRegex(ValueError, "suffix '.pkl'; expected .npz"):
             policies.save(make(), self.folder / 'p.pkl')
         with self.assertRaisesRegex(FileNotFoundError, 'does not exist'):
@@ -574,16 +533,12 @@ class FileTest(FolderTest):
         ({'strides': np.array([2, 1, 1])}, "'filter_2': is missing", make_convolving),
         ({'strides': np.array([2])}, "'filter_1': is unknown", make_convolving),
         ({'filter_bias_1': None}, "'filter_bias_1': is missing", make_convolving),
-        (
-            {'filter_0': np.zeros((3, 4))},
-            "'filter_0': has type float64 and 2 axes",
-            make_convolving,
-        ),
+        ({'filter_0': np.zeros((3, 4))}, "'filter_0': has type float64 and 2 axes", make_convolving),
         ({'origin': 0.5}, "'origin': has type float64", make_convolving),
         ({'layer_norm': 2}, "'layer_norm': is 2; expected 1", make_convolving),
         ({'grid': np.array([7, 6])}, 'grid: .* does not divide', make_seeing),
         *(({name: None}, f'{name}.*missing') for name in NEEDED),
-    )
+    )  # fmt: skip
     def test_invalid_arguments_are_rejected(self, changes, message, made=make):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
             self.load_with(made(), **changes)
@@ -628,85 +583,77 @@ class ReferenceTest(FolderTest):
             )
         )  # fmt: skip
 
+    def save(self, id_, variant='', name=None, **changes):
+        (self.folder / variant).mkdir(exist_ok=True)
+        policies.save(make(id=id_, **changes), self.folder / variant / f'{name or id_}.npz')
+
+    def share(self, id_, variant='', **entry):
+        text = json.dumps({id_: {**entry, 'evaluation': {}}})
+        (self.folder / variant / policies.SHARED).write_text(text)
+
     def test_by_id_and_alias(self):
-        dog = 'PD_Dog2D_Gaps_Terrain-v0'
         self.assertEqual(policies.available(), ())
-        policies.save(make(id=dog), self.folder / f'{dog}.npz')
-        policies.save(make(id=GAPS), self.folder / f'{GAPS}.npz')
-        self.assertEqual(policies.available(), (GAPS, dog))
-        self.assertEqual(policies.reference(dog).id, dog)
-        for id_ in (dog, 'plaid/dog_gaps'):
-            self.assertEqual(suite.reference_policy(id_).id, dog)
-            self.assertEqual(trl_suite.reference_policy(id_).id, dog)
+        with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; none is installed"):
+            policies.reference(GAPS)
+        for id_ in (DOG, GAPS):
+            self.save(id_)
+        self.assertEqual(policies.available(), (GAPS, DOG))
+        self.assertEqual(policies.reference(DOG).id, DOG)
+        for id_ in (DOG, 'plaid/dog_gaps'):
+            self.assertEqual(suite.reference_policy(id_).id, DOG)
+            self.assertEqual(trl_suite.reference_policy(id_).id, DOG)
         for id_ in (3, None, [GAPS]):
             with self.assertRaisesRegex(TypeError, 'the id of an environment is a string, not '):
                 policies.reference(id_)
-        with self.assertRaisesRegex(FileNotFoundError, f'closest ids with a policy: {dog}, {GAPS}'):
+        with self.assertRaisesRegex(FileNotFoundError, f'closest ids with a policy: {DOG}, {GAPS}'):
             policies.reference('PD_Dog2D_Steps_Terrain-v0')
-        with self.assertRaisesRegex(ValueError, "unknown environment 'x'"):
-            suite.reference_policy('x')
-        with self.assertRaisesRegex(ValueError, "did you mean 'plaid/dog_gaps'"):
-            suite.reference_policy('plaid/dog_gap')
+        self.save('other', name='PD_Dog2D_Steps_Terrain-v0')
+        assert_refused(
+            self,
+            (lambda: suite.reference_policy('x'), "unknown environment 'x'"),
+            (lambda: suite.reference_policy('plaid/dog_gap'), "did you mean 'plaid/dog_gaps'"),
+            (lambda: policies.reference('PD_Dog2D_Steps_Terrain-v0'),
+             "PD_Dog2D_Steps_Terrain-v0.npz: field 'id': is 'other'"),
+        )  # fmt: skip
 
     def test_a_policy_of_another_environment(self):
-        dog, steps = 'PD_Dog2D_Gaps_Terrain-v0', 'PD_Dog2D_Steps_Terrain-v0'
-        policies.save(make(id=dog), self.folder / f'{dog}.npz')
-        shared = {steps: {'policy': dog, 'evaluation': {}}}
-        (self.folder / policies.SHARED).write_text(json.dumps(shared))
-        self.assertEqual(policies.available(), (dog, steps))
-        own, other = map(policies.reference, (dog, steps))
-        self.assertEqual((own.id, other.id), (dog, steps))
-        self.assertEqual([policies.trained_for(id_) for id_ in (dog, steps)], [dog, dog])
+        steps = 'PD_Dog2D_Steps_Terrain-v0'
+        self.save(DOG)
+        self.share(steps, policy=DOG)
+        self.assertEqual(policies.available(), (DOG, steps))
+        own, other = map(policies.reference, (DOG, steps))
+        self.assertEqual((own.id, other.id), (DOG, steps))
+        self.assertEqual([policies.trained_for(id_) for id_ in (DOG, steps)], [DOG, DOG])
         np.testing.assert_array_equal(own.weights[0], other.weights[0])
 
     def test_a_policy_that_prefers_the_default_gait(self):
         raptor, slopes = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes-v0'
-        policies.save(make(id=raptor, choices=[[0.5, 0], [0, 0]]), self.folder / f'{raptor}.npz')
-        shared = {slopes: {'policy': raptor, 'preference': 1.5, 'evaluation': {}}}
-        (self.folder / policies.SHARED).write_text(json.dumps(shared))
+        self.save(raptor, choices=[[0.5, 0], [0, 0]])
+        self.share(slopes, policy=raptor, preference=1.5)
         self.assertEqual(list(map(policies.preference_for, (raptor, slopes))), [0.0, 1.5])
         own, other = map(policies.reference, (raptor, slopes))
         np.testing.assert_allclose(other.biases[-1], own.biases[-1] + [0, 1.5], rtol=1e-6)
 
-    def test_a_variant_is_in_a_folder_of_its_own(self):
-        dog = 'PD_Dog2D_Gaps_Terrain-v0'
-        policies.save(make(id=dog), self.folder / f'{dog}.npz')
+    def test_variants_are_in_folders_of_their_own(self):
+        """A generalist is the policy of several environments."""
+        mixed = 'PD_Dog2D_Mixed_Terrain-v0'
+        self.save(DOG)
         self.assertEqual(policies.available('randomized'), ())
-        with self.assertRaisesRegex(
-            FileNotFoundError, f"no randomized policy is shipped for '{dog}'"
-        ):
-            policies.reference(dog, 'randomized')
-        (self.folder / 'randomized').mkdir()
-        other = make(id=dog, info={'seed': 7})
-        policies.save(other, self.folder / 'randomized' / f'{dog}.npz')
-        self.assertEqual(policies.available('randomized'), (dog,))
-        self.assertEqual(policies.reference(dog, 'randomized').info, {'seed': 7})
-        self.assertEqual(suite.reference_policy('plaid/dog_gaps', 'randomized').info, {'seed': 7})
-        self.assertNotEqual(policies.reference(dog).info, {'seed': 7})
+        with self.assertRaisesRegex(FileNotFoundError, f"no randomized .* shipped for '{DOG}'"):
+            policies.reference(DOG, 'randomized')
+        self.save(DOG, 'randomized', info={'seed': 7})
+        self.save(mixed, 'generalist', info={'seed': 8})
+        self.share(DOG, 'generalist', policy=mixed)
+        for variant, ids, seed in (('randomized', (DOG,), 7), ('generalist', (DOG, mixed), 8)):
+            self.assertEqual(policies.available(variant), ids)
+            for found in (
+                policies.reference(DOG, variant), suite.reference_policy('plaid/dog_gaps', variant),
+            ):  # fmt: skip
+                self.assertEqual((found.id, found.info), (DOG, {'seed': seed}))
+        self.assertEqual(policies.available(), (DOG,))
+        self.assertNotIn(policies.reference(DOG).info['seed'], (7, 8))
         with self.assertRaisesRegex(ValueError, "variant of policies 'random'.*'randomized'"):
-            policies.reference(dog, 'random')
-
-    def test_a_generalist_is_the_policy_of_several_environments(self):
-        mixed, gaps = 'PD_Dog2D_Mixed_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'
-        policies.save(make(id=gaps), self.folder / f'{gaps}.npz')
-        folder = self.folder / 'generalist'
-        folder.mkdir()
-        policies.save(make(id=mixed, info={'seed': 7}), folder / f'{mixed}.npz')
-        (folder / policies.SHARED).write_text(json.dumps({gaps: {'policy': mixed}}))
-        self.assertEqual(policies.available('generalist'), (gaps, mixed))
-        self.assertEqual(policies.available(), (gaps,))
-        found = suite.reference_policy('plaid/dog_gaps', 'generalist')
-        self.assertEqual((found.id, found.info), (gaps, {'seed': 7}))
-        self.assertNotEqual(policies.reference(gaps).info, {'seed': 7})
-
-    def test_no_policies_at_all(self):
-        with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; none is installed"):
-            policies.reference(GAPS)
-
-    def test_a_file_of_another_environment(self):
-        policies.save(make(id='other'), self.folder / f'{GAPS}.npz')
-        with self.assertRaisesRegex(ValueError, f"{GAPS}.npz: field 'id': is 'other'"):
-            policies.reference(GAPS)
+            policies.reference(DOG, 'random')
 
 
 class ShippedTest(parameterized.TestCase):
@@ -721,32 +668,19 @@ class ShippedTest(parameterized.TestCase):
         folder = resources.directory('trained')
         names = {path.stem for path in folder.iterdir() if path.suffix in ('.npz', '.json')}
         studies = {
-            'footsteps',
-            'default_gaits',
-            'oracles',
-            'oracle_falls',
-            'plans',
-            'shared',
-            'transfer',
-        }  # see trained/README.md
+            'footsteps', 'default_gaits', 'oracles', 'oracle_falls', 'plans', 'shared', 'transfer',
+        }  # fmt: skip
         self.assertEqual(names - set(catalogue.BY_ID) - studies, set())
         self.assertTrue((folder / 'README.md').exists())
 
     def test_every_planar_environment_that_tracks_a_clip_has_one(self):
-        specs = [
-            spec
-            for spec in catalogue.SPECS
-            if spec.task_type == 'planar_imitation' and 'planar' in spec.tags
-        ]
-        self.assertLen(specs, 42)
-        self.assertContainsSubset([spec.id for spec in specs], policies.available())
+        specs = [spec for spec in catalogue.SPECS if spec.task_type == 'planar_imitation']
+        ids = [spec.id for spec in specs if 'planar' in spec.tags]
+        self.assertLen(ids, 42)
+        self.assertContainsSubset(ids, policies.available())
 
     @parameterized.parameters(
-        *(
-            spec.id
-            for spec in catalogue.SPECS
-            if spec.domain == 'plaid' and spec.id in policies.available()
-        )
+        *(id_ for id_ in policies.available() if catalogue.BY_ID[id_].domain == 'plaid')
     )
     def test_walkers_that_do_not_fall_advance(self, id_):
         """A policy that stands still in front of a wall until the time limit is not shipped."""
