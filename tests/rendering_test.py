@@ -50,16 +50,14 @@ def drawn_ground(environment):
 
 
 class FrameTest(parameterized.TestCase):
-    def test_frame_equals_physics_render(self):
-        environment = make()
-        image = rendering.frame(environment, **SMALL)
-        self.assertEqual((image.shape, image.dtype), ((120, 160, 3), np.uint8))
-        direct = environment.physics.render(120, 160, 'biped2d_full/side')
-        np.testing.assert_array_equal(image, direct)
-
     def test_cameras_by_short_and_full_name_and_number(self):
+        """Frames are what `physics.render` draws; by default of the camera at the side."""
         environment = make()
         side, front = (rendering.frame(environment, camera=c, **SMALL) for c in ('side', 'front'))
+        self.assertEqual((side.shape, side.dtype), ((120, 160, 3), np.uint8))
+        direct = environment.physics.render(120, 160, 'biped2d_full/side')
+        for image in (direct, rendering.frame(environment, **SMALL)):
+            np.testing.assert_array_equal(image, side)
         self.assertGreater(np.mean(np.any(side != front, axis=2)), 0.1)
         for name, image in (('side', side), ('front', front)):
             full = f'biped2d_full/{name}'
@@ -112,19 +110,16 @@ class CameraTest(parameterized.TestCase):
         physics = self.physics()
         physics.data.qpos[1] = -1.7
         physics.forward()
-        np.testing.assert_allclose(
-            self.place(physics, [0, -3, 0]), [0, -1.7 - cameras.NEAREST, 0], atol=1e-3
-        )
+        expected = [0, -1.7 - cameras.NEAREST, 0]
+        np.testing.assert_allclose(self.place(physics, [0, -3, 0]), expected, atol=1e-3)
 
     def test_character_keeps_its_size_in_the_picture(self):
         physics = self.physics()
-        camera = physics.model.ptr.cam_fovy
+        angle = physics.model.ptr.cam_fovy
         with cameras.outside_obstacles(physics, 0):
-            away = -physics.data.cam_xpos[0, 1]
-            self.assertAlmostEqual(
-                away * np.tan(np.deg2rad(camera[0]) / 2), 3 * np.tan(np.deg2rad(20)), places=6
-            )
-        self.assertEqual(camera[0], 40)
+            half = -physics.data.cam_xpos[0, 1] * np.tan(np.deg2rad(angle[0]) / 2)
+        self.assertAlmostEqual(half, 3 * np.tan(np.deg2rad(20)), places=6)
+        self.assertEqual(angle[0], 40)
         np.testing.assert_array_equal(physics.data.cam_xpos[0], [0, -3, 0])
 
     def test_cameras_of_frames_are_in_no_block(self):
@@ -415,20 +410,18 @@ class SpatialTest(FolderTest):
         shown = {round(alpha, 6) for mover, alpha in colours if not mover}
         self.assertEqual(shown, {overlays.GHOST_COLOUR[3]})
 
-        @parameterized.parameters(
-            ('steps3d', 10, 1), ('gaps', 20, 0)
-        )  # side by side, below each other
-        def test_pictures_of_terrain_depend_on_the_seed(self, terrain, length, axis):
-            for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
-                path, options = self.folder / f'{name}.png', {'draws': 2, **options}
-                rendering.plot_terrain(terrain, path, length=length, **options)
-            a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
-            np.testing.assert_array_equal(a, b)
-            self.assertFalse(np.array_equal(a, c))
-            self.assertGreater(a.shape[axis], d.shape[axis])
-            for preset in ('plane', 'conveyor3d'):  # level ground
-                rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
-            self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
+    @parameterized.parameters(('steps3d', 10, 1), ('gaps', 20, 0))  # beside, below each other
+    def test_pictures_of_terrain_depend_on_the_seed(self, terrain, length, axis):
+        for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
+            path, options = self.folder / f'{name}.png', {'draws': 2, **options}
+            rendering.plot_terrain(terrain, path, length=length, **options)
+        a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
+        np.testing.assert_array_equal(a, b)
+        self.assertFalse(np.array_equal(a, c))
+        self.assertGreater(a.shape[axis], d.shape[axis])
+        for preset in ('plane', 'conveyor3d'):  # level ground
+            rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
+        self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
 
 
 @functools.cache
@@ -553,17 +546,54 @@ class ThreadTest(parameterized.TestCase):
     """An environment may be drawn, closed and freed in any thread; nothing is printed."""
 
     @parameterized.named_parameters(
-        ('frame', 'print(same(elsewhere(picture), picture(), elsewhere(picture)))'),
-        ('physics_render', 'print(same(elsewhere(direct), direct(), elsewhere(direct)))'),
-        ('closed_elsewhere', 'picture(); elsewhere(one.close); print(True)'),
-        ('closed_by_a_third', 'elsewhere(picture); elsewhere(one.close); print(True)'),
-        (
-            'collected_elsewhere',
-            "picture(); one.cycle, one = one, None; elsewhere(gc.collect); print(True)",
-        ),
-        (
-            'at_exit_in_a_living_thread',
-            """
+        ('one_after_the_other', """
+            PARTS = [
+                'same(elsewhere(picture), picture(), elsewhere(picture))',
+                'same(elsewhere(direct), direct(), elsewhere(direct))',
+                'picture() is not None and elsewhere(one.close) is None',
+                'elsewhere(picture) is not None and elsewhere(one.close) is None',
+                'picture() is not None and forget() and elsewhere(gc.collect) > 0',
+                'same(*pool(), picture())',
+                'same(direct(), direct(overlays=[Free()]), direct())',
+                'uploaded()',
+            ]
+
+            def forget():
+                global one
+                one.cycle = one
+                one = None
+                return True
+
+            def pool():
+                environments = [make() for _ in range(4)]
+                def look(environment):
+                    return rendering.frame(environment, 48, 64)
+                with ThreadPoolExecutor(3) as pool:
+                    pictures = [each for _ in range(3) for each in pool.map(look, environments)]
+                    list(pool.map(lambda each: each.close(), environments))
+                return pictures
+
+            class Free:  # another context, while one is in use
+                def __init__(self):
+                    self.two = make()
+                    rendering.frame(self.two)
+                def draw(self, context, rect):
+                    self.two.close()
+
+            def uploaded():  # a height field
+                global one
+                one = make('PD_Biped3D_Imitate-Hills-v0')
+                assert one.physics.model.nhfield
+                elsewhere(picture)
+                one.reset()
+                return same(picture(), elsewhere(picture))
+
+            for part in PARTS:
+                one = make()
+                assert eval(part), part
+            print(True)
+            """),
+        ('at_exit_in_a_living_thread', """
             drawn = threading.Event()
             def stay():
                 picture()
@@ -571,45 +601,9 @@ class ThreadTest(parameterized.TestCase):
                 threading.Event().wait()
             threading.Thread(target=stay, daemon=True).start()
             print(drawn.wait(50))
-            """,
-        ),
-        (
-            'many_in_a_pool',
-            """
-            environments = [make() for _ in range(4)]
-            def look(environment):
-                return rendering.frame(environment, 48, 64)
-            with ThreadPoolExecutor(3) as pool:
-                pictures = [each for _ in range(3) for each in pool.map(look, environments)]
-                list(pool.map(lambda each: each.close(), environments))
-            print(same(picture(), *pictures))
-            """,
-        ),
-        (
-            'freed_while_another_is_drawn',
-            """
-            class Free:
-                def draw(self, context, rect):
-                    two.close()
-            before, two = direct(), make()
-            rendering.frame(two)
-            print(same(before, direct(overlays=[Free()]), direct()))
-            """,
-        ),
+            """),
         ('between_those_of_dm_control', 'print(same(dm.render(), (picture(), dm.render())[1]))'),
-        (
-            'height_field',
-            """
-            one = make('PD_Biped3D_Imitate-Hills-v0')
-            assert one.physics.model.nhfield
-            elsewhere(picture)
-            one.reset()  # uploads it
-            print(same(picture(), elsewhere(picture)))
-            """,
-        ),
-        (
-            'half_a_context',
-            """
+        ('half_a_context', """
             with mock.patch('mujoco.MjrContext', side_effect=mujoco.FatalError('no memory')):
                 for draw in picture, direct, picture:
                     try:
@@ -619,11 +613,8 @@ class ThreadTest(parameterized.TestCase):
                         assert 'no memory' in str(error), error
             gc.collect()
             print(same(picture(), elsewhere(picture)))
-            """,
-        ),
-        (
-            'forked',
-            """
+            """),
+        ('forked', """
             one = make('PD_Biped3D_Imitate-Hills-v0')
             picture()
             child = os.fork()
@@ -642,8 +633,7 @@ class ThreadTest(parameterized.TestCase):
                 gc.collect()
                 raise SystemExit
             print(os.waitpid(child, 0)[1] == 0 and same(picture()))
-            """,
-        ),
+            """),
     )  # fmt: skip
     def test_any_thread(self, program):
         if 'fork' in program and not hasattr(os, 'fork'):
