@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
-from helpers import KINDS, LONG, assert_refused
+from helpers import LONG, assert_refused
 
 from trl_suite import rendering, suite
 from trl_suite.adapters.gym import flat as flat_info
@@ -24,7 +24,7 @@ FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SHORT = {'step_limit': 20}  # so that random actions meet both ends: falls and the limit
 SMALL = {'height': 48, 'width': 64}
 ONE_OF_EACH = (
-    GAPS, 'PD_Biped3D_Imitate-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'PD_Biped3D_HLC_Soccer-v0',
+    GAPS, 'PD_Biped3D_LLC_General_Step-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'PD_Biped3D_HLC_Soccer-v0',
 )  # fmt: skip
 # Two for each Box: unbounded values are declared without bounds.
 UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
@@ -72,15 +72,14 @@ class SingleTest(Same, parameterized.TestCase):
                 outputs.append(env.reset())
         return outputs
 
-    @parameterized.parameters(*KINDS)
+    @parameterized.parameters(*ONE_OF_EACH)
     def test_check_env(self, id_):
         """Gymnasium's checks pass, and an episode of a seed is that of the suite."""
         spec = suite.find(id_)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always')
             env = gymnasium.make(f'trl_suite/{id_}', render_mode='rgb_array', render_kwargs=SMALL)
-            # The checker would build another to draw it and one to close it.
-            full = id_ in ONE_OF_EACH
+            full = id_ == GAPS  # the checker would build another to draw it and one to close it
             check_env(env.unwrapped, skip_render_check=not full, skip_close_check=not full)
             env_render_passive_checker(env.unwrapped)
         messages = [str(each.message) for each in caught]
@@ -113,19 +112,14 @@ class SingleTest(Same, parameterized.TestCase):
         env.close()
         env.close()  # may be called twice
 
-    def test_dict_flattens_to_flat(self):
-        flat = SuiteEnv(GAPS)
-        blocks = gymnasium.make(f'trl_suite/{GAPS}', flat_observation=False).unwrapped
-        flattened = gymnasium.wrappers.FlattenObservation(blocks)
-        self.assertEqual(flattened.observation_space, flat.observation_space)
-        for ours, theirs in zip(self.rollout(flat), self.rollout(flattened), strict=True):
-            np.testing.assert_array_equal(ours[0], theirs[0])
-
-    def test_dtype(self):
+    def test_observations(self):
+        """Blocks or flat, in single or double precision."""
         half, full = self.rollout(SuiteEnv(GAPS)), self.rollout(SuiteEnv(GAPS, dtype=np.float64))
-        for single, double in zip(half, full, strict=True):
+        blocks = self.rollout(gymnasium.make(f'trl_suite/{GAPS}', flat_observation=False).unwrapped)
+        for single, double, parts in zip(half, full, blocks, strict=True):
             self.assertEqual((single[0].dtype, double[0].dtype), (np.float32, np.float64))
-            self.assertTrue((double[0].astype(np.float32) == single[0]).all())
+            np.testing.assert_array_equal(double[0].astype(np.float32), single[0])
+            np.testing.assert_array_equal(np.concatenate([*parts[0].values()]), single[0])
         self.assertEqual(SuiteEnv(GAPS, dtype=np.float64).action_space.dtype, np.float64)
 
     def test_a_fall_in_the_step_of_the_limit(self):
@@ -142,21 +136,13 @@ class SingleTest(Same, parameterized.TestCase):
         for env, seed in (
             (gymnasium.make(id_, max_episode_steps=steps), 1), (gymnasium.make(id_, **limited), 1),
             (SuiteEnv(GAPS, max_episode_steps=steps), 1),
-            *((gymnasium.make_vec(
-                id_, 1, vectorization_mode=mode, max_episode_steps=steps, **options), [1])
-              for mode, options in (('sync', {}), (None, {}), (None, {'autoreset_mode': 'SameStep'}))),
+            (gymnasium.make_vec(id_, 1, max_episode_steps=steps, autoreset_mode='SameStep'), [1]),
         ):  # fmt: skip
             env.reset(seed=seed)
             actions = idle if seed == 1 else idle[None]
             flags = [env.step(actions)[2:4] for _ in range(steps)]
             self.assertEqual([*map(bool, flags[-1])], [True, True], env)
             self.assertFalse(np.any(flags[:-1]))
-
-    def test_free_combination(self):
-        env = SuiteEnv(suite.build('raptor', actuation='muscle', terrain='gaps_humanoid'))
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')  # as above
-            check_env(env, skip_render_check=True)
 
     def test_pickle_in_the_middle_of_an_episode(self):
         env = gymnasium.make(f'trl_suite/{GAPS}').unwrapped
@@ -190,11 +176,9 @@ class SingleTest(Same, parameterized.TestCase):
         self.assertGreater(np.std(expected), 5)
         self.assertEqual(env.metadata['render_fps'], 30)
         for id_, fps in (
-            ('PD_Biped3D_HLC_Soccer-v0', 2),
-            ('PD_Biped3D_HLC_PathFollowing_Run-v0', 3),
-        ):
+            ('PD_Biped3D_HLC_Soccer-v0', 2), ('PD_Biped3D_HLC_PathFollowing_Run-v0', 3),
+        ):  # fmt: skip
             self.assertEqual(SuiteEnv(id_).metadata['render_fps'], fps)
-            self.assertEqual(SuiteVectorEnv(id_, 2).metadata['render_fps'], fps)
         silent = SuiteEnv(GAPS)
         silent.reset()
         self.assertIsNone(silent.render())
@@ -228,20 +212,14 @@ class SingleTest(Same, parameterized.TestCase):
             with self.assertRaisesRegex(ValueError, 'seed'):
                 env.reset(seed=seed)
         env.reset(seed=np.int64(3))
-        for action in (np.zeros(5), np.zeros((1, 6)), np.full(6, np.nan), [np.inf] * 6, 'abcdef'):
-            with self.assertRaises(ValueError):
-                env.step(action)
+        with self.assertRaises(ValueError):
+            env.step(np.zeros(5))
         env.step(idle)  # unharmed
         short = SuiteEnv(FLAT, task_kwargs={'step_limit': 1})
         short.reset()
         short.step(idle)
         with self.assertRaises(gymnasium.error.ResetNeeded):
             short.step(idle)
-        env.close()
-        env.close()
-        for call in (env.reset, env.render, lambda: env.step(idle)):
-            with self.assertRaisesRegex(RuntimeError, 'closed'):
-                call()
 
 
 class VectorTest(Same, parameterized.TestCase):
@@ -268,12 +246,11 @@ class VectorTest(Same, parameterized.TestCase):
         else:
             super().assert_same(ours, theirs, where)
 
-    @parameterized.product(
-        ({'flat_observation': True, 'dtype': np.float32}, {'flat_observation': False, 'dtype': np.float64}),
-        mode=(AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP),
-    )  # fmt: skip
-    def test_autoreset(self, mode, **options):
-        ours, theirs = self.pair(mode, **options)
+    @parameterized.parameters(
+        (AutoresetMode.NEXT_STEP, True, np.float32), (AutoresetMode.SAME_STEP, False, np.float64)
+    )
+    def test_autoreset(self, mode, flat, dtype):
+        ours, theirs = self.pair(mode, flat_observation=flat, dtype=dtype)
         falls = limits = 0
         for step in range(60):
             action = ours.action_space.sample()
@@ -334,34 +311,33 @@ class VectorTest(Same, parameterized.TestCase):
         options = {'task_kwargs': {'step_limit': 8, **options}}
         given = options if steps is None else {**options, 'max_episode_steps': steps}
         ours = gymnasium.make_vec(f'trl_suite/{GAPS}', 2, num_threads=1, **given)
-        theirs = gymnasium.make_vec(f'trl_suite/{GAPS}', 2, 'sync', **given)
-        own = SuiteEnv(GAPS, **given)
-        again = gymnasium.make_vec(ours.spec)
-        for each in theirs, again:
-            self.assert_same(ours.reset(seed=[5, 9])[0], each.reset(seed=[5, 9])[0])
-        own.reset(seed=5)
-        clip, count, over = own.environment.task.clip_action, 0, False
-        while not over:
+        own, over = SuiteEnv(GAPS, **given), np.zeros(2, bool)
+        ours.reset(seed=[5, 9]), own.reset(seed=5)
+        clip, count = own.environment.task.clip_action, 0
+        while not over[0]:
             action = np.tile(np.clip(clip(0), -1, 1), (2, 1))
-            our, their, count = ours.step(action), theirs.step(action), count + 1
-            self.assert_same(our[:1] + our[2:4], their[:1] + their[2:4])
-            self.assert_same(our, again.step(action))
-            _, _, terminated, over, _ = own.step(action[0])
-            self.assertEqual((terminated, over), (our[2][0], our[3][0]))
-        self.assertEqual(count, expected)
+            _, _, fell, over, _ = ours.step(action)
+            count += 1
+            self.assertEqual(own.step(action[0])[2:4], (fell[0], over[0]))
+        self.assertEqual((count, over.tolist()), (expected, [True, True]))
 
     def test_one_limit(self):
         """That of `gymnasium.make` replaces that of the row, as of Gymnasium's own environments."""
         id_ = f'trl_suite/{FLAT}'
-        self.assertEqual(gymnasium.make(id_).spec.max_episode_steps, 256)
         longer = gymnasium.make(id_, max_episode_steps=999)
         self.assertEqual(longer.spec.max_episode_steps, 999)
         self.assertIsNone(longer.unwrapped.environment.step_limit)
-        for steps, expected in ((None, 256), (999, 999), (-1, None), (9, 9)):
+        for steps, expected in ((None, 256), (999, 999), (-1, None)):
             options = {} if steps is None else {'max_episode_steps': steps}
-            self.assertEqual(SuiteEnv(FLAT, **options).environment.step_limit, expected)
             envs = gymnasium.make_vec(id_, 2, num_threads=1, **options)
             self.assertEqual(envs.environment.step_limit, expected)
+
+    def test_levels(self):
+        options = {'task_kwargs': {'levels': (0, 9)}}
+        env = gymnasium.make(f'trl_suite/{GAPS}', **options)
+        self.assertEqual(env.reset(seed=1, options={'level': 4})[1]['level'], 4)
+        envs = gymnasium.make_vec(f'trl_suite/{GAPS}', 2, **options)
+        self.assertEqual(envs.reset(options={'level': [4, 6]})[1]['level'].tolist(), [4, 6])
 
     def test_async(self):
         """Single environments live in processes as well."""
@@ -398,7 +374,6 @@ class VectorTest(Same, parameterized.TestCase):
         for name in 'render_mode', 'observation_space', 'action_space':
             for read in 'call', 'get_attr':
                 self.assertEqual(getattr(ours, read)(name), getattr(theirs, read)(name), name)
-        np.testing.assert_array_equal(ours.call('render'), theirs.call('render'))
         self.assertEqual(ours.get_attr('step_limit'), (256, 256))
         self.assertEqual(ours.get_attr('seeds'), (4, 7))  # each has its own
         with self.assertRaisesRegex(AttributeError, "no attribute 'step_limt'"):
@@ -413,22 +388,16 @@ class VectorTest(Same, parameterized.TestCase):
         envs = SuiteVectorEnv(FLAT, 2, num_threads=1)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
             envs.step(np.zeros((2, 6)))
-        for seed in ([1], [1, None], [-1, 2], [0.5, 1.5], -1):
-            with self.assertRaises(ValueError):
-                envs.reset(seed=seed)
+        masks = ([True], np.array([1, 0]), np.zeros(2, bool), 'no')
+        assert_refused(
+            self,
+            *((lambda s=s: envs.reset(seed=s), 'seed') for s in ([1], [1, None], [-1, 2], [0.5, 1.5], -1)),
+            *((lambda m=m: envs.reset(options={'reset_mask': m}), 'reset_mask') for m in masks),
+        )  # fmt: skip
         envs.reset(seed=1)
-        for mask in ([True], np.array([1, 0]), np.zeros(2, bool), 'no'):
-            with self.assertRaisesRegex(ValueError, 'reset_mask'):
-                envs.reset(options={'reset_mask': mask})
-        for action in (np.zeros((2, 5)), np.zeros(6), np.full((2, 6), np.nan)):
-            with self.assertRaises(ValueError):
-                envs.step(action)
+        with self.assertRaises(ValueError):
+            envs.step(np.zeros((2, 5)))
         envs.step(np.zeros((2, 6)))  # unharmed
-        envs.close()
-        envs.close()
-        for call in (envs.reset, lambda: envs.step(np.zeros((2, 6)))):
-            with self.assertRaisesRegex(RuntimeError, 'closed'):
-                call()
 
 
 class ImportTest(parameterized.TestCase):

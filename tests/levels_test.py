@@ -1,10 +1,9 @@
 """Levels: terrain that depends on the level alone, in single and vector environments, and choices."""
 
-import gymnasium
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
+from helpers import assert_refused
 
-import trl_suite.adapters.gym  # noqa: F401  registers environments
 from trl_suite import suite
 from trl_suite.terrain import PlanarGround
 from trl_suite.vector import VectorEnvironment
@@ -53,23 +52,6 @@ class LevelsTest(parameterized.TestCase):
         x = np.linspace(0, 15, 200)
         np.testing.assert_allclose(task.arena.height(x[None])[0], expected.height(x), atol=1e-9)
 
-    def test_single_and_vector_environments_draw_the_same_levels(self):
-        options = {'levels': (0, 1000)}
-        id_ = 'PD_Dog2D_Mixed_Terrain-v0'
-        environments = VectorEnvironment(id_, 3, 2, [4, 5, 6], task_kwargs=options)
-        singles = [suite.make(id_, {'random': seed, **options}) for seed in (4, 5, 6)]
-        action = np.zeros((3, len(environments.action_map)))
-        for _ in range(2):
-            environments.reset()
-            steps = [single.reset() for single in singles]
-            self.assertEqual(environments.level.tolist(), [single.level for single in singles])
-            found = environments.step(action)
-            for i, single in enumerate(singles):
-                steps[i] = single.step(action[i])
-                blocks = np.concatenate([*steps[i].observation.values()])
-                np.testing.assert_array_equal(found.observation[i], blocks)
-        self.assertLen(set(environments.level), 3)
-
     def test_a_chosen_level_counts_once(self):
         environments = VectorEnvironment('plaid/dog_gaps', 4, 1, 1, task_kwargs={'levels': (0, 9)})
         environments.reset(level=8)
@@ -85,37 +67,21 @@ class LevelsTest(parameterized.TestCase):
         environments.reset()
         self.assertEqual(environments.level.tolist(), drawn)
 
-    def test_gymnasium(self):
-        id_, options = 'trl_suite/PD_Dog2D_Gaps_Terrain-v0', {'task_kwargs': {'levels': (0, 9)}}
-        env = gymnasium.make(id_, **options)
-        _, info = env.reset(seed=1, options={'level': 4})
-        self.assertEqual((info['level'], env.unwrapped.environment.level), (4, 4))
-        envs = gymnasium.make_vec(id_, 2, **options)
-        _, info = envs.reset(seed=1, options={'level': [4, 6]})
-        self.assertEqual(info['level'].tolist(), [4, 6])
-
-    @parameterized.parameters(
-        ((0, 0), 'levels is .0, 0.; expected the first level, at least 0, and the number of levels, at least 1'),
-        ((-1, 5), 'levels is .-1, 5.; expected None or a list of whole numbers at least 0'),
-        ((2**32, 1), 'all levels below 4294967296'),
-        (5, 'levels is 5; expected None or a list of whole numbers'),
-        ((1, 2, 3), 'levels is .1, 2, 3.; expected the first level'),
-    )  # fmt: skip
-    def test_invalid_options(self, levels, message):
-        with self.assertRaisesRegex(ValueError, message):
-            suite.make('plaid/dog_gaps', {'levels': levels})
-
     def test_invalid_levels(self):
-        environment = suite.make('plaid/dog_gaps', {'levels': (3, 2)})
-        for level in (2, 5, 3.5, 'three'):
-            with self.assertRaisesRegex(ValueError, f'level is .*{level}.*from 3 to 4'):
-                environment.reset(level)
-        with self.assertRaisesRegex(ValueError, "expected an environment with the option 'levels'"):
-            suite.make('plaid/dog_gaps').reset(0)
-        environments = VectorEnvironment('plaid/dog_gaps', 2, 1, task_kwargs={'levels': (3, 2)})
-        with self.assertRaisesRegex(ValueError, '3 levels for 2 simulations'):
-            environments.reset(level=[3, 3, 3])
-
-
-if __name__ == '__main__':
-    absltest.main()
+        id_ = 'plaid/dog_gaps'
+        environment = suite.make(id_, {'levels': (3, 2)})
+        several = VectorEnvironment(id_, 2, 1, task_kwargs={'levels': (3, 2)})
+        needs = "expected an environment with the option 'levels'"
+        assert_refused(
+            self,
+            *((lambda g=g: suite.make(id_, {'levels': g}), message) for g, message in (
+                ((0, 0), 'levels is .0, 0.; expected the first level, at least 0, and the number of levels, at least 1'),
+                ((-1, 5), 'levels is .-1, 5.; expected None or a list of whole numbers at least 0'),
+                ((2**32, 1), 'all levels below 4294967296'),
+                (5, 'levels is 5; expected None or a list of whole numbers'),
+                ((1, 2, 3), 'levels is .1, 2, 3.; expected the first level'),
+            )),
+            *((lambda n=n: environment.reset(n), f'level is .*{n}.*from 3 to 4') for n in (2, 5, 3.5, 'three')),
+            (lambda: suite.make(id_).reset(0), needs),
+            (lambda: several.reset(level=[3, 3, 3]), '3 levels for 2 simulations'),
+        )  # fmt: skip

@@ -11,7 +11,6 @@ from unittest import mock
 import cli_test
 import gymnasium
 import numpy as np
-from absl.testing import absltest
 
 if importlib.util.find_spec('minari') is None:
     raise unittest.SkipTest('needs minari')
@@ -85,7 +84,3 @@ class DataSetTest(cli_test.CommandTest):
         with self.assertRaisesRegex(ValueError, 'episodes is 0'):
             adapter.write(ID, 'random', 0)
         self.assertEqual([path.name for path in (self.folder / 'a').iterdir()], [name])
-
-
-if __name__ == '__main__':
-    absltest.main()
