@@ -2,11 +2,10 @@
 
 import dataclasses
 import pathlib
-import tempfile
 
 import numpy as np
-from absl.testing import absltest, parameterized
-from helpers import made
+from absl.testing import parameterized
+from helpers import FolderTest, assert_refused, made, put
 
 from trl_suite import policies, suite
 from trl_suite.bodies.reference import joint_targets
@@ -49,12 +48,6 @@ def observed(environment):
     return environment.observation()['observations']
 
 
-def put(environment, pose, rate):
-    task, data = environment.task, environment.physics.data
-    data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
-    environment.physics.forward()
-
-
 def state(environment):
     task, data = environment.task, environment.physics.data
     return data.qpos[task.figure.pose_qpos].copy(), data.qvel[task.figure.pose_dof].copy()
@@ -74,7 +67,7 @@ def disturbed(environment, rng, angle=0.4):
 class TaskTest(parameterized.TestCase):
     """The mirror of a task against the reflection of its state."""
 
-    @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.0, 0.13, 0.4)))
+    @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.13, 0.4)))
     def test_half_a_cycle_later_all_is_reflected(self, case, phase):
         # Clips are symmetric, and so is ground of which the middle line is a line of symmetry.
         environment, first = build(case, start_phase=phase)
@@ -134,10 +127,10 @@ class TaskTest(parameterized.TestCase):
             np.testing.assert_allclose(found[0], reflect.pose(pose), rtol=0, atol=1e-6)
             np.testing.assert_allclose(found[1], reflect.velocity(rate), rtol=0, atol=1e-4)
 
-    @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.05, 0.45)))
-    def test_a_mirrored_environment_is_the_reflection_of_the_plain_one(self, case, phase):
-        plain, first = build(case, start_phase=phase)
-        mirrored, seen = build(case, start_phase=phase, mirrored=True)
+    @parameterized.parameters(*CASES)
+    def test_a_mirrored_environment_is_the_reflection_of_the_plain_one(self, *case):
+        plain, first = build(case, start_phase=0.45)
+        mirrored, seen = build(case, start_phase=0.45, mirrored=True)
         mirror, rng = plain.task.mirror, np.random.default_rng(2)
         self.assertIsNone(mirrored.task.mirror)  # nothing is left to reflect
         self.assertEqual(mirrored.action_spec(), plain.action_spec())
@@ -155,8 +148,7 @@ class TaskTest(parameterized.TestCase):
             seen, first = (each.observation['observations'] for each in (seen, first))
             np.testing.assert_array_equal(mirrored.physics.data.qpos, plain.physics.data.qpos)
             np.testing.assert_array_equal(mirrored.physics.data.qvel, plain.physics.data.qvel)
-        if phase > 0.4:
-            self.assertEqual(sides, {False, True})
+        self.assertEqual(sides, {False, True})
 
     def check(self, mirrored, plain, seen, canonical):
         """Compares a mirrored observation with the plain one as it is in right stance."""
@@ -170,25 +162,6 @@ class TaskTest(parameterized.TestCase):
                 np.testing.assert_array_equal(expected[[0, 1, 2, 9, 10, 11]], 0)
                 expected = np.concatenate([expected[12:], expected[3:6], expected[6:9]])
             np.testing.assert_array_equal(seen[part], expected, err_msg=name)
-
-    def test_each_simulation_is_reflected_by_its_own_phase(self):
-        plain = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0)
-        mirrored = VectorEnvironment(
-            'PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0, task_kwargs={'mirrored': True}
-        )
-        first, _ = plain.reset(), mirrored.reset()
-        mirror, rng, both = plain.task.mirror, np.random.default_rng(0), 0
-        for _ in range(20):
-            left = mirror.left(first)
-            both += 0 < left.sum() < 6
-            action = 0.3 * rng.uniform(-1, 1, (6, 17))
-            a, b = plain.step(mirror.unmirror_action(action, left)), mirrored.step(action)
-            np.testing.assert_array_equal(a.reward, b.reward)
-            first = a.observation
-            canonical, left = mirror.canonical(first)
-            np.testing.assert_array_equal(left, plain.task.phase >= 0.5)
-            np.testing.assert_array_equal(b.observation[:, :105], canonical[:, :105])
-        self.assertGreater(both, 5)
 
     def test_tasks_without_a_phase_have_no_mirror(self):
         self.assertIsNone(suite.make('PD_Biped3D_Imitate-Track-v0').task.mirror)
@@ -245,7 +218,7 @@ class PlanTest(parameterized.TestCase):
 
     @parameterized.parameters('Forest', 'Conveyors_Wide', 'LargeBlocks', 'PathFollowing_Run')
     def test_maps(self, name):
-        environment = suite.make(f'PD_Biped3D_HLC_{name}-v0', {'random': 1})
+        environment = made(f'PD_Biped3D_HLC_{name}-v0')
         blocks_, mirror = environment.blocks, environment.task.mirror
         size = len(mirror.observation_index)
         mirror.check(size, len(environment.action_map))
@@ -253,13 +226,11 @@ class PlanTest(parameterized.TestCase):
         reflected = mirror.observation(seen)
         np.testing.assert_array_equal(mirror.observation(reflected), seen)
         np.testing.assert_array_equal(mirror.left(reflected), ~mirror.left(seen))
-        lines = lambda o, name: o[:, blocks_[name]].reshape(2, -1, 32, 32)[:, :, ::-1]  # noqa: E731
         for name, signs in (('terrain', (1,)), ('surface', (1, -1))):
             if name in blocks_:
-                expected = lines(seen, name) * np.reshape(signs, (-1, 1, 1))
-                np.testing.assert_array_equal(
-                    reflected[:, blocks_[name]], expected.reshape(2, -1), err_msg=name
-                )
+                lines = seen[:, blocks_[name]].reshape(2, -1, 32, 32)[:, :, ::-1]
+                expected = (lines * np.reshape(signs, (-1, 1, 1))).reshape(2, -1)
+                np.testing.assert_array_equal(reflected[:, blocks_[name]], expected, err_msg=name)
 
     def test_every_footstep_begins_with_a_foot_ahead(self):
         specs = VectorEnvironment(SOCCER, 16, 1, seed=0)
@@ -304,22 +275,19 @@ class MirrorTest(parameterized.TestCase):
         np.testing.assert_array_equal(mirror.left(observation), [True, False, False])
         np.testing.assert_array_equal(mirror.observation(observation[:1]), [[1, -3, -2, 0.25]])
 
-    @parameterized.parameters(
-        ({'observation_index': np.array([0, 1, 1, 3])}, 'mirror_observation_index'),
-        ({'observation_index': np.arange(3)}, 'mirror_observation_index'),
-        ({'observation_sign': np.array([1, -1, 0.5, 1])}, 'mirror_observation_sign'),
-        ({'action_index': np.array([1, 2])}, 'mirror_action_index'),
-        ({'action_sign': np.ones(3)}, 'mirror_action_sign'),
-        ({'phase': 4}, 'mirror_phase'), ({'phase': -1}, 'mirror_phase'),
-        ({'phase': None}, 'mirror_phase, mirror_feet'), ({'feet': (1, 2)}, 'mirror_phase, mirror_feet'),
-        ({'phase': None, 'feet': (1, 1)}, 'mirror_feet'),
-        ({'phase': None, 'feet': (4, 1)}, 'mirror_feet'),
-        ({'phase': None, 'feet': (1,)}, 'mirror_feet'),
-    )  # fmt: skip
-    def test_invalid_arguments_are_rejected(self, changes, message):
+    def test_invalid_arguments_are_rejected(self):
+        cases = (
+            ({'observation_index': np.array([0, 1, 1, 3])}, 'mirror_observation_index'),
+            ({'observation_index': np.arange(3)}, 'mirror_observation_index'),
+            ({'observation_sign': np.array([1, -1, 0.5, 1])}, 'mirror_observation_sign'),
+            ({'action_index': np.array([1, 2])}, 'mirror_action_index'),
+            ({'action_sign': np.ones(3)}, 'mirror_action_sign'),
+            ({'phase': 4}, 'mirror_phase'), ({'phase': -1}, 'mirror_phase'),
+            ({'phase': None}, 'mirror_phase, mirror_feet'), ({'feet': (1, 2)}, 'mirror_phase, mirror_feet'),
+            *(({'phase': None, 'feet': feet}, 'mirror_feet') for feet in ((1, 1), (4, 1), (1,))),
+        )  # fmt: skip
         self.make().check(4, 2)
-        with self.assertRaisesRegex(ValueError, message):
-            self.make(**changes).check(4, 2)
+        assert_refused(self, *((lambda c=c: self.make(**c).check(4, 2), name) for c, name in cases))
 
 
 def policy_for(environment, **changes):
@@ -339,14 +307,12 @@ def policy_for(environment, **changes):
     return policies.Policy(**{**fields, **changes})
 
 
-class PolicyTest(parameterized.TestCase):
+class PolicyTest(FolderTest):
     """Policies that reflect left stance to right stance."""
 
     def setUp(self):
         super().setUp()
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.path = pathlib.Path(folder.name) / 'p.npz'
+        self.path = self.folder / 'p.npz'
         self.environment, _ = build(STEP)
         self.policy = policy_for(self.environment)
         environments = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 30, 1, seed=4)
@@ -389,28 +355,25 @@ class PolicyTest(parameterized.TestCase):
         policies.save(dataclasses.replace(self.policy, mirror=None), self.path)
         self.assertIsNone(policies.load(self.path).mirror)
 
-    @parameterized.parameters(
-        ({'mirror_phase': None}, 'mirror_phase'),
-        ({'mirror_action_sign': None}, 'mirror_action_sign'),
-        ({'mirror_action_sign': np.zeros(17, np.float32)}, 'mirror_action_sign'),
-        ({'mirror_action_index': np.arange(16)}, 'mirror_action_index'),
-        ({'mirror_observation_index': np.zeros(125, int)}, 'mirror_observation_index'),
-        ({'mirror_observation_sign': np.array(['a'] * 125)}, 'mirror_observation_sign'),
-        ({'mirror_phase': np.array(125)}, 'mirror_phase'),
-        ({'mirror_side': np.array(1)}, 'mirror_'),
-    )
-    def test_malformed_files_are_rejected(self, changes, message):
+    def test_malformed_files_are_rejected(self):
         policies.save(self.policy, self.path)
         with np.load(self.path) as data:
-            fields = {**data, **changes}
-        np.savez(self.path, **{name: value for name, value in fields.items() if value is not None})
-        with self.assertRaisesRegex(ValueError, f'{self.path.name}.*{message}'):
-            policies.load(self.path)
+            stored = dict(data)
+        for changes, message in (
+            ({'mirror_phase': None}, 'mirror_phase'), ({'mirror_action_sign': None}, 'mirror_action_sign'),
+            ({'mirror_action_sign': np.zeros(17, np.float32)}, 'mirror_action_sign'),
+            ({'mirror_action_index': np.arange(16)}, 'mirror_action_index'),
+            ({'mirror_observation_index': np.zeros(125, int)}, 'mirror_observation_index'),
+            ({'mirror_observation_sign': np.array(['a'] * 125)}, 'mirror_observation_sign'),
+            ({'mirror_phase': np.array(125)}, 'mirror_phase'), ({'mirror_side': np.array(1)}, 'mirror_'),
+        ):  # fmt: skip
+            fields = {
+                name: value for name, value in {**stored, **changes}.items() if value is not None
+            }
+            np.savez(self.path, **fields)
+            with self.assertRaisesRegex(ValueError, f'{self.path.name}.*{message}'):
+                policies.load(self.path)
 
     def test_a_mirror_that_does_not_fit_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'mirror_observation_index'):
             policy_for(self.environment, mirror=build(WALK)[0].task.mirror)
-
-
-if __name__ == '__main__':
-    absltest.main()
