@@ -7,10 +7,10 @@ from dm_control import mjcf
 from dm_control.locomotion.arenas import floors
 from helpers import assert_refused
 
-from trl_suite import actuation, characters, controllers, terrain
-from trl_suite.arenas import PlanarArena
+from trl_suite import actuation, characters, controllers, suite
 from trl_suite.controllers import dynamics, machine, parameters
-from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
+from trl_suite.engine import PhysicsWorld
+from trl_suite.vector import VectorEnvironment
 
 DT = 1 / 600
 NAMES = ('dog', 'goat', 'raptor', 'biped2d_simbicon', 'hopper')
@@ -56,6 +56,13 @@ STATES = {
 }
 # The foot: middle of the lower face of its box, from the link's joint.
 SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
+
+
+_made = {}  # environments, by name and number of simulations
+
+
+def tearDownModule():
+    _made.clear()
 
 
 class ParametersTest(parameterized.TestCase):
@@ -113,7 +120,7 @@ class ParametersTest(parameterized.TestCase):
         )
         arena, biped = floors.Floor(), characters.make('biped2d')
         arena.attach(biped)
-        rig = Rig('dog', 3, batch=True)
+        rig = Rig('dog', 3)
         before, size = rig.gait.state.vector.copy(), rig.gait.state.vector.shape[1]
         shapes = (3, size + 10_000), (3, size - 1), (2, size), (size,), (1, 3, size)
         assert_refused(
@@ -131,29 +138,17 @@ class ParametersTest(parameterized.TestCase):
 
 
 class Rig:
-    """A character and its gait in a world without a task."""
+    """Characters with gaits, whose states and contacts a test sets."""
 
-    def __init__(self, name, n=1, batch=False):
-        arena = PlanarArena(terrain.load('flat'))
-        self.character = characters.make(name)
-        self.character.create_root_joints(arena.attach(self.character))
-        self.gait = controllers.Gait(self.character, arena.ground_body, arena.mjcf_model)
-        actuation.add(self.character, 'torque', DT / 2)
-        for joint in self.character.joints:
-            joint.damping = joint.armature = 0
-        arena.mjcf_model.option.timestep = DT / 2
-        if batch:
-            model = light_model(arena.mjcf_model)
-            self.world = BatchWorld(model, n, 1, dynamics.FIELDS)
-        else:
-            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # keeps it alive
-            self.world = PhysicsWorld(self.physics, dynamics.FIELDS)
-        arena.bind(self.world)
-        self.gait.bind(self.world)
-        self.env_ids = np.arange(self.world.n)
-        for env_id in self.env_ids:
-            arena.begin_episode(env_id, terrain.PlanarGround(arena.terrain, 0))
-        self.rules, self.name = self.gait.rules, name
+    def __init__(self, name, n=1):
+        if (name, n) not in _made:
+            spec = suite.combine(name, 'gait', 'flat', 'gait')
+            _made[name, n] = VectorEnvironment(spec, n, 1, seed=0)
+        environments, self.name = _made[name, n], name
+        environments.reset()
+        task = environments.task
+        self.character, self.gait, self.world = task.character, task.gait, task.world
+        self.env_ids, self.rules = self.world.all_ids, self.gait.rules
         self.joints = list(self.character.spec.joints)
         self.touches(())
         self.gait.begin(self.env_ids)
@@ -182,12 +177,8 @@ class Rig:
     def touches(self, links):
         """Overrides contacts until the next step: names of links, or (n, L) bool."""
         on = np.isin(self.character.spec.links, links) if isinstance(links, tuple) else links
-        first, sensed = self.rules.machine.contact, self.world.sensordata
-        if isinstance(self.world, BatchWorld):
-            sensed = sensed.base
-        else:
-            sensed = self.physics.data.sensordata[None]
-        sensed[:, first : first + len(self.character.spec.links)] = on
+        first = self.rules.machine.contact
+        self.world.sensordata.base[:, first : first + len(self.character.spec.links)] = on
 
     def data(self, env_id=0):
         """The engine's own view of one simulation, and the columns of its degrees of freedom."""
@@ -256,9 +247,9 @@ def dense_pd(rig, env_id, off=()):
 class LawTest(parameterized.TestCase):
     """Joint torques against the formulas."""
 
-    @parameterized.product(name=NAMES, batch=(False, True))
-    def test_stable_pd(self, name, batch):
-        rig = Rig(name, 3 if batch else 1, batch)
+    @parameterized.parameters(*NAMES)
+    def test_stable_pd(self, name):
+        rig = Rig(name, 3)
         rng = rig.scatter(5)
         gait = rig.gait
         targets, torque = gait.state.target, rig.rules.scratch.torque
@@ -428,7 +419,7 @@ class LawTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_torques_stay_within_limits(self, name):
-        rig = Rig(name, 40, batch=True)
+        rig = Rig(name, 40)
         rng = rig.scatter(9, speed=30.0)
         gait, limits = rig.gait, rig.character.torque_limits
         spread = np.maximum(5 * np.abs(gait.parameters.action_scale), 3.0)
