@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import io
 import json
@@ -292,13 +293,13 @@ class ReadingTest(ClipTest):
 
     def test_refused(self):
         (self.folder / 'note.bvh').touch()
-        missing = lambda: retargeting.read(self.folder / 'none.bvh', PLAIN)  # noqa: E731
-        assert_refused(self, (missing, "did you mean 'note.bvh'"), error=FileNotFoundError)
+        with self.assertRaisesRegex(FileNotFoundError, "did you mean 'note.bvh'"):
+            retargeting.read(self.folder / 'none.bvh', PLAIN)
         for name, text, message, skeleton in UNUSABLE:
             asf = self.folder / 'a.asf' if skeleton else None
             (self.folder / 'a.asf').write_text(skeleton or '')
             (self.folder / name).write_text(text)
-            read = lambda name=name, asf=asf: retargeting.read(self.folder / name, PLAIN, asf)  # noqa: E731
+            read = functools.partial(retargeting.read, self.folder / name, PLAIN, asf)
             assert_refused(self, (read, message))
 
     def test_damaged_files(self):
@@ -309,9 +310,9 @@ class ReadingTest(ClipTest):
             changed = whole[name][: found.start()] + after + whole[name][found.end() :]
             paths[name].write_bytes(changed.encode('latin-1'))
             if name == 'a.bvh':
-                read = lambda: retargeting.read(paths['a.bvh'], PLAIN)  # noqa: E731
+                read = functools.partial(retargeting.read, paths['a.bvh'], PLAIN)
             else:
-                read = lambda: motion.read_amc(paths['a.amc'], paths['a.asf'])  # noqa: E731
+                read = functools.partial(motion.read_amc, paths['a.amc'], paths['a.asf'])
             assert_refused(self, (read, rf'{re.escape(name)}.*{message}'))
             paths[name].write_text(whole[name])
 
@@ -427,11 +428,10 @@ class CheckTest(parameterized.TestCase):
     def test_errors(self):
         walk = dataclasses.replace(motion.load('biped2d_walk'), loop=False)
         short = CycleTest.unrolled(None, 'biped2d_walk', 0.2)
-        mapped = lambda ours, theirs: {'root': 'root', ours: theirs}  # noqa: E731
-        assert_refused(self, *((lambda c=c: c[0](*c[1:]), message) for *c, message in (
+        assert_refused(self, *((functools.partial(*call), message) for *call, message in (
             (clip_check.check, walk, 'raptor', "'biped2d_walk'.*does not fit 'raptor'"),
-            (retargeting.retarget, walk, 'raptor', mapped('left_nee', 'left_knee'), "unknown joint of the character 'left_nee'"),
-            (retargeting.retarget, walk, 'raptor', mapped('left_knee', 'knee'), "joint of the motion 'knee'; did you mean"),
+            (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_nee': 'left_knee'}, "unknown joint of the character 'left_nee'"),
+            (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_knee': 'knee'}, "joint of the motion 'knee'; did you mean"),
             (retargeting.retarget, walk, 'dog', 'the root, or all other joints'),
             (retargeting.retarget, walk, 'raptor', None, 0, 'scale is 0'), (retargeting.cycle, walk, 0.1, 'both or none'),
             (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1 s'), (retargeting.cycle, short, 'lasts 0.2 s'),

@@ -1,6 +1,7 @@
 """Tests of trl_suite.terrain: values from the papers and the original's description."""
 
 import copy
+import functools
 import itertools
 import json
 import math
@@ -417,7 +418,7 @@ class RefusalTest(FolderTest):
             (lambda: terrain.load('gap_humanoid'), "'gaps_humanoid'"),
             (lambda: terrain.load('pilars3d'), "'pillars3d'"),
         )  # fmt: skip
-        missing = lambda: terrain.load('no_such_terrain.json')  # noqa: E731
+        missing = functools.partial(terrain.load, 'no_such_terrain.json')
         assert_refused(self, (missing, 'no such file'), error=FileNotFoundError)
         assert_refused(self, (lambda: terrain.load(3), 'int'), error=TypeError)
 
@@ -427,7 +428,10 @@ class RefusalTest(FolderTest):
             terrain.SpatialGround(terrain.load(name), 0)
             for name in ('hills3d', 'dynamic_obstacles3d')
         )
-        draw = lambda length, kind='flat': generators.draw(f'var2d_{kind}', {}, length, rng)  # noqa: E731
+
+        def draw(length, kind='flat'):
+            return generators.draw(f'var2d_{kind}', {}, length, rng)
+
         assert_refused(
             self,
             *((lambda c=c, x=x: c(x), '') for x in (math.nan, math.inf, -math.inf, 1.1e6, -1.1e6) for c in (
@@ -479,7 +483,10 @@ class RegisterTest(parameterized.TestCase):
         self.assertIs(terrain.GENERATORS['var2d_gaps'].function, saw)
         height, low = terrain.Parameter(0.5, 0.0, 2.0), terrain.Parameter(1, low=0)
         terrain.register('mine', {'H': height, 'W': 1, 'L': low})(saw)
-        mine = lambda **values: lambda: terrain.load({'Type': 'mine', 'Params': [values]})  # noqa: E731
+
+        def mine(**values):
+            return functools.partial(terrain.load, {'Type': 'mine', 'Params': [values]})
+
         mine(H=2, W=-1e6)()
         assert_refused(
             self,
