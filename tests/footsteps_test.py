@@ -1,5 +1,7 @@
 """Tests of the tasks that track footsteps, in the plane and in 3D: clock, plans, reward, landings."""
 
+import functools
+
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import (
@@ -18,6 +20,7 @@ from helpers import (
     put,
 )
 from helpers import STEP_WEIGHTS as WEIGHTS
+from imitation_test import begin_at
 
 from trl_suite import motion, suite
 from trl_suite.tasks.footsteps.planner import Plans, Pushes, StraightPlans
@@ -31,8 +34,9 @@ BOTH = (PLANAR, GENERAL)
 SIDE = {RIGHT: -1, LEFT: 1}
 
 
-def started(id_=GENERAL, **options):
+def started(id_=GENERAL, start_phase=None, **options):
     environment = made(id_, seed=8, step_limit=None, **options)
+    begin_at(environment, start_phase)
     return environment, environment.reset()
 
 
@@ -163,9 +167,10 @@ class ClockTest(parameterized.TestCase):
             x, z = np.moveaxis(found, -1, 0)
             self.assertLess(z[:, stance].max() + 0.02, z[:, 1 - stance].min())
             self.assertLess(np.ptp(x[:, stance]), 0.25 * np.ptp(x[:, 1 - stance]))
-        again = task.clip.mirrored().mirrored()
-        self.assertTrue(suite.build(character, task='footsteps', clip=again).reset().first())
-        wrong = lambda: suite.build(character, task='footsteps', clip=task.clip.mirrored())  # noqa: E731
+        again = suite.build(character, task='footsteps', clip=task.clip.mirrored().mirrored())
+        self.assertTrue(again.reset().first())
+        mirrored = task.clip.mirrored()
+        wrong = functools.partial(suite.build, character, task='footsteps', clip=mirrored)
         assert_refused(self, (wrong, r'expected the right foot on the ground.*clip\.mirrored'))
 
 
@@ -677,10 +682,10 @@ REFUSED = (
 
 class OptionTest(parameterized.TestCase):
     def test_refused(self):
-        wrong = lambda: suite.build('biped3d_mocap', task='footsteps', clip='biped3d_full_mocap')  # noqa: E731
+        build = functools.partial(suite.build, task='footsteps', clip='biped3d_full_mocap')
         assert_refused(
             self, *((lambda i=i, o=o: suite.make(i, o), message) for i, o, message in REFUSED),
-            (wrong, "'biped3d_full_mocap'.*does not fit.*'biped3d_mocap'"),
+            (lambda: build('biped3d_mocap'), "'biped3d_full_mocap'.*does not fit.*'biped3d_mocap'"),
         )  # fmt: skip
 
     def test_options_as_objects(self):

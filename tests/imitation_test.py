@@ -8,6 +8,7 @@ from absl.testing import absltest, parameterized
 from helpers import assert_refused, assert_uniform, flattened, ground, made, put
 
 from trl_suite import motion, suite, terrain
+from trl_suite.tasks.common.control import start_phases
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
@@ -219,8 +220,15 @@ def reference(environment):
     return probe(other)
 
 
-def started(id_, steps=0, **options):
+def begin_at(environment, phase):
+    """Has episodes start at a phase, as the option would; None for what the option says."""
+    task = environment.task
+    task._start_phase = start_phases(task.config.start_phase if phase is None else phase)
+
+
+def started(id_, steps=0, start_phase=None, **options):
     environment = made(id_, seed=8, step_limit=None, **options)
+    begin_at(environment, start_phase)
     step = environment.reset()
     rng = np.random.default_rng(9)
     for _ in range(steps):
@@ -520,7 +528,8 @@ class ResetTest(parameterized.TestCase):
 
     @parameterized.parameters(BIPED, HILLS)
     def test_start_phase(self, id_):
-        environment, step = started(id_, start_phase=0.6)
+        environment = made(id_, seed=8, start_phase=0.6)
+        step = environment.reset()
         for _ in range(3):
             self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-9)
             step = environment.reset()
