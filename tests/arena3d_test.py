@@ -1,6 +1,7 @@
 """Tests of the three-dimensional arena: the collision geometry is the ground, and it moves."""
 
 import dataclasses
+import functools
 import pickle
 
 import mujoco
@@ -190,7 +191,7 @@ class GeometryTest(parameterized.TestCase):
 
         self.addCleanup(generators._generators.pop, 'steep3d')
         arena = Stage('dynamic_obstacles3d', (5, 6, 7), batch=True).arena
-        recentre = lambda xy: lambda: arena.recentre(np.arange(3), xy)  # noqa: E731
+        recentre = functools.partial(functools.partial, arena.recentre, np.arange(3))
         assert_refused(
             self,
             (lambda: SpatialArena(terrain.load('gaps')), 'gaps'),

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import warnings
 from unittest import mock
@@ -759,9 +760,14 @@ class OptionTest(FolderTest):
 
     def test_refused(self):
         frame = started(PLANE, interface='frame')[0].task
-        lay = lambda action: lambda: frame.lay(action)  # noqa: E731
-        ball = lambda name: lambda: suite.build('biped3d_mocap', terrain=name, task='soccer')  # noqa: E731
-        script = lambda id_, **options: lambda: scripted.scripted(suite.make(id_, options))  # noqa: E731
+        lay = functools.partial(functools.partial, frame.lay)
+
+        def ball(name):
+            return functools.partial(suite.build, 'biped3d_mocap', terrain=name, task='soccer')
+
+        def script(id_, **options):
+            return functools.partial(scripted.scripted, made(id_, **options))
+
         (self.folder / 'broken.npz').write_bytes(b'no')
         assert_refused(
             self,

@@ -636,15 +636,15 @@ class RegisterTest(parameterized.TestCase):
             ({'boxes': lambda low, high: flat}, 'finite Boxes'),
         )))  # fmt: skip
         terrain.register3d('array3d')(lambda parameters, rng: np.zeros(3))
-        array = lambda: make({'Type': 'array3d'})  # noqa: E731
         # Not the kinds of parts of the samples.
-        grid = lambda i, j: np.zeros((len(i), len(j)))  # noqa: E731
-        terrain.register3d('mine3d', replace=True)(
-            lambda parameters, rng: terrain.Layout(grid=grid)
-        )
+        self.of(grid=lambda i, j: np.zeros((len(i), len(j))))
         holds = terrain.capacity(terrain.load({'Type': 'mine3d'}))._replace(grid=False)
-        moody = lambda: terrain.Surroundings(1, holds).begin(0, make({'Type': 'mine3d'}))  # noqa: E731
-        assert_refused(self, (array, 'must return a Layout'), (moody, 'mine3d.*same kinds'))
+        moody = functools.partial(terrain.Surroundings(1, holds).begin, 0, make({'Type': 'mine3d'}))
+        assert_refused(
+            self,
+            (functools.partial(make, {'Type': 'array3d'}), 'must return a Layout'),
+            (moody, 'mine3d.*same kinds'),
+        )
 
     @parameterized.parameters('boxes', 'belts', 'movers', 'function')
     def test_arrays_that_do_not_fit_are_rejected(self, part):
@@ -657,7 +657,7 @@ class RegisterTest(parameterized.TestCase):
             )
         for field in _TWO._fields[:4]:
             boxes = replaced(_TWO, field, SPOILT[0][0])
-            query = lambda boxes=boxes: boxes.touching((-1, -1), (1, 1))  # noqa: E731
+            query = functools.partial(boxes.touching, (-1, -1), (1, 1))
             assert_refused(self, (query, r'boxes\.\w+ has shape .*; expected \('))
 
 
