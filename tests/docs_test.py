@@ -13,7 +13,7 @@ from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import FolderTest
+from helpers import FolderTest, besides_notices
 from PIL import Image
 
 from trl_suite import characters, describe, policies, suite, terrain
@@ -43,21 +43,23 @@ def tracked_pages():
     return [path for path in DOCS.rglob('*.md') if not only_on_the_site(path)]
 
 
-class PagesTest(parameterized.TestCase):
+def built(path):
+    """Whether a picture is drawn with the site."""
+    return path.parent.name in gallery.BUILT
+
+
+class PagesTest(FolderTest):
     def test_pages_are_up_to_date(self):
         """Generated pages equal the stored ones: run `python docs/generate.py` if this fails."""
         self.assertEqual(list(generate.stale(generate.pages())), [])
 
-    def test_indexes_name_everything(self):
-        for page, names in (
-            ('environments', catalogue.BY_ID),
-            ('characters', characters.CHARACTERS),
-            ('terrains', generate.presets()),
-        ):
-            rows = re.findall(
-                r'^\| `(\S+)` \|', (DOCS / f'{page}.md').read_text('utf-8'), re.MULTILINE
-            )
-            self.assertContainsSubset(names, rows)
+    @parameterized.parameters(
+        ('environments', catalogue.BY_ID), ('characters', characters.CHARACTERS),
+        ('terrains', generate.presets()),
+    )  # fmt: skip
+    def test_indexes_name_everything(self, page, names):
+        text = (DOCS / f'{page}.md').read_text('utf-8')
+        self.assertContainsSubset(names, re.findall(r'^\| `(\S+)` \|', text, re.MULTILINE))
 
     def test_pages_of_the_site_are_not_tracked(self):
         ignored = (ROOT / '.gitignore').read_text(encoding='utf-8').splitlines()
@@ -67,92 +69,59 @@ class PagesTest(parameterized.TestCase):
             self.assertIn(f'prune docs/{folder}', left_out)
 
     @parameterized.parameters(
-        ('PD_Biped2D_Gaps_Terrain-v0', 'pose', 'end_effector', 'terrain_observation'),
-        ('FSM_Hopper2D_Terrain_Walls-v0', 'velocity', 'speed', 'base_actions'),
-    )
-    def test_the_page_of_an_environment(self, id_, observed, rewarded, option):
-        text = self.page(f'environments/{id_}.md')
-        spec = catalogue.BY_ID[id_]
-        self.assertStartsWith(text, f'# {id_}\n\n{spec.description}\n')
-        tables = dict(re.findall(r'^## (\w+).*\n\n(\|[^#]*)', text, re.MULTILINE))
-        for title, header, row in (
-            ('Observation', '| block | from | to | size | unit | meaning |', observed),
-            ('Action', '| index |', ''),
-            ('Reward', '| term | weight | scale | unit | error, or share |', rewarded),
-            ('Options', '| option | default | unit | meaning |', option),
-            ('Links', '| link and joint | kg |', ''),
-        ):
-            self.assertStartsWith(tables[title], header)
-            self.assertIn(f'\n| {row}', tables[title])
-        self.assertIn('\n## Differences from the original\n\n- ', text)
-
-    def test_the_pages_of_a_family_a_character_and_a_terrain(self):
-        self.assertIn(f'| [{GAPS}](../environments/{GAPS}.md)<br>', self.page('families/plaid.md'))
-        self.assertIn(
-            '\n## Links and joints\n\n| link and joint | kg |', self.page('characters/dog.md')
-        )
-        terrains = self.page('terrains/injectinput_slopes.md')
-        self.assertIn('\n## Parameters\n\n| parameter | unit | value |', terrains)
+        (f'environments/{GAPS}.md',
+         '## Observation', '| pose |', '## Action', '| index |', '## Reward', '| end_effector |',
+         '## Options', '| terrain_observation |', '## Links', '## Differences from the original'),
+        ('environments/FSM_Hopper2D_Terrain_Walls-v0.md', '| velocity |', '| speed |', '| base_actions |'),
+        ('families/plaid.md', f'| [{GAPS}](../environments/{GAPS}.md)<br>'),
+        ('characters/dog.md', '## Links and joints\n\n| link and joint | kg |'),
+        ('terrains/injectinput_slopes.md', '## Parameters\n\n| parameter | unit | value |'),
+    )  # fmt: skip
+    def test_pages_of_the_site(self, path, *parts):
+        """They have their parts in this order, and all of their links have targets."""
+        pages = generate.site_pages()
+        text, place = pages[path](), 0
+        for part in parts:
+            place = text.index(f'\n{part}', place)
+        for link in _LINK.findall(text):
+            target = (DOCS / path).parent.joinpath(link).resolve()
+            found = target.relative_to(DOCS).as_posix() in pages or target.exists()
+            self.assertTrue(found or built(target), f'{path}: {link}')
 
     @parameterized.parameters(
-        'CONTRIBUTING',
-        'docs/quick_start',
-        'docs/concepts',
-        'docs/realism',
+        'README', 'CONTRIBUTING', 'docs/quick_start', 'docs/concepts', 'docs/guide', 'docs/realism',
         'docs/reports/robustness',
-    )
+    )  # fmt: skip
     def test_code_runs(self, name):
         text = (ROOT / f'{name}.md').read_text(encoding='utf-8')
         code = '\n'.join(re.findall('```python\n(.*?)```', text, re.DOTALL))
         self.assertNotEmpty(code)
-        with contextlib.redirect_stdout(io.StringIO()):
+        with (
+            contextlib.chdir(self.folder),
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()) as told,
+        ):
             exec(compile(code, f'{name}.md', 'exec'), {'__name__': 'page'})
+        self.assertEqual(besides_notices(told.getvalue()), '')
 
-    def page(self, path):
-        """Returns the text of a page of the site, all of whose links have targets."""
-        pages = generate.site_pages()
-        text = pages[path]()
-        for link in _LINK.findall(text):
-            target = (DOCS / path).parent.joinpath(link).resolve()
-            found = target.relative_to(DOCS).as_posix() in pages or target.exists()
-            self.assertTrue(found or target.parent.name in gallery.BUILT, f'{path}: {link}')
-        return text
-
-    def test_links_have_targets(self):
+    def test_links_have_targets_and_pictures_are_used(self):
         """Every link target of a page is in the repository, and is not empty."""
+        linked = set()
         for file in (ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *tracked_pages()):
             for link in _LINK.findall(file.read_text(encoding='utf-8')):
                 target = (file.parent / link).resolve()
+                linked.add(target)
                 self.assertTrue(target.exists(), f'{file}: {link}')
                 if target.is_relative_to(DOCS):
-                    self.assertFalse(only_on_the_site(target), f'{file}: {link}')
-                    self.assertNotIn(target.parent.name, gallery.BUILT, f'{file}: {link}')
+                    self.assertFalse(only_on_the_site(target) or built(target), f'{file}: {link}')
                 if target.is_file():
                     self.assertGreater(target.stat().st_size, 0, f'{file}: {link}')
-
-    def test_pictures_are_small_and_used(self):
-        pictures = {
-            path
-            for path in (DOCS / 'pictures').rglob('*')
-            if path.is_file() and path.parent.name not in gallery.BUILT
-        }
+        folder = DOCS / 'pictures'
+        pictures = {each for each in folder.rglob('*') if each.is_file() and not built(each)}
         self.assertLess(sum(path.stat().st_size for path in pictures), LARGEST)
-        made = {DOCS / 'pictures' / item.path for item in gallery.items()}
-        made = {path for path in made if path.parent.name not in gallery.BUILT}
+        made = {folder / item.path for item in gallery.items() if not built(folder / item.path)}
         self.assertEqual(made - pictures, set())
-        linked = {
-            (file.parent / link).resolve()
-            for file in (ROOT / 'README.md', *tracked_pages())
-            for link in _LINK.findall(file.read_text(encoding='utf-8'))
-        }
         self.assertEqual(pictures - made - linked, set())
-
-    def test_numbers_in_the_readme(self):
-        text = (ROOT / 'README.md').read_text(encoding='utf-8')
-        self.assertIn(f'{len(catalogue.SPECS)} environments', text)
-        self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
-        for domain, tasks in suite.TASKS_BY_DOMAIN.items():
-            self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
 
 
 class TablesTest(FolderTest):
@@ -181,19 +150,12 @@ class TablesTest(FolderTest):
             json.loads(path.read_text())['scores']
             for path in (DOCS / 'continual' / 'plaid_biped').glob('Plaid_s*.json')
         ]
-        last, flat = (
-            np.mean([each[4][4] for each in scores]),
-            np.mean([each[0][0] for each in scores]),
-        )
-        change = np.mean([each[4][0] for each in scores]) / flat - 1
+        last, change = np.mean([each[4][4] for each in scores]), np.mean(scores, 0)[[0, 4], 0]
         final, changed = papers.plaid(0), papers.plaid(1)
-        self.assertRegex(
-            final,
-            rf'published \| \.891.*\n\|  \| our biped .* \| {papers.figure(last)} \| \S+ \|\n',
-        )
-        self.assertRegex(
-            changed, rf'published \| \.054.*\n\|  \| our biped \| {papers.figure(change)} '
-        )
+        last, change = papers.figure(last), papers.figure(change[1] / change[0] - 1)
+        row = rf'published \| \.891.*\n\|  \| our biped .* \| {last} \| \S+ \|\n'
+        self.assertRegex(final, row)
+        self.assertRegex(changed, rf'published \| \.054.*\n\|  \| our biped \| {change} ')
 
 
 class ContributingTest(absltest.TestCase):
@@ -243,22 +205,16 @@ class GalleryTest(FolderTest):
             ('families', len(suite.TASKS_BY_DOMAIN)),
         ):  # fmt: skip
             self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
-        self.assertIn('suite.webp', paths)
-        self.assertIn('terrains/gaps.png', paths)
-        self.assertIn('terrains/plane.jpg', paths)
+        self.assertContainsSubset(('suite.webp', 'terrains/gaps.png', 'terrains/plane.jpg'), paths)
         sources = [item.path for item in items if item.source]
         self.assertLen(sources, len(policies.available()) + len(trained))  # film strips and curves
 
     def test_pictures(self):
         for only in (
-            'Hopper2D_Terrain_Walls-',
-            'characters/hopper',
-            'terrains/gaps.png',
-            f'curves/{GAPS}',
-        ):
+            'Hopper2D_Terrain_Walls-', 'characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}',
+        ):  # fmt: skip
             written, failed = gallery.make(self.folder, only)
-            self.assertLen(written, 1)
-            self.assertEmpty(failed)
+            self.assertEqual((len(written), failed), (1, {}))
         files = {path.name: path for path in self.folder.rglob('*.*g')}
         strip = 'FSM_Hopper2D_Terrain_Walls-v0.jpg'
         self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png'])
@@ -294,14 +250,12 @@ class GalleryTest(FolderTest):
         def draw():
             raise error
 
-        items = [
-            gallery.Item('a.png', draw),
-            gallery.Item('b.png', lambda: np.zeros((9, 9, 3), 'u1')),
-        ]
+        grey = np.zeros((9, 9, 3), 'u1')
+        items = gallery.Item('a.png', draw), gallery.Item('b.png', lambda: grey)
         with mock.patch.object(gallery, 'items', lambda: iter(items)):
             found = gallery.make(self.folder)
         self.assertEqual(found, ([self.folder / 'b.png'], {'a.png': error}))
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['b.png'])
+        self.assert_only('b.png')
         with self.assertRaisesRegex(ValueError, "no picture matches 'cat'"):
             gallery.make(self.folder, 'cat')
 
@@ -370,9 +324,7 @@ class SiteTest(absltest.TestCase):
     def test_pages_from_outside_the_folder(self):
         for name, path in conf.ELSEWHERE.items():
             text = self.page(name)
-            self.assertEqual(
-                text.partition('\n')[0], path.read_text(encoding='utf-8').partition('\n')[0]
-            )
+            self.assertStartsWith(text, path.read_text(encoding='utf-8').partition('\n')[0] + '\n')
             for link in _LINK.findall(text):
                 self.assertTrue((DOCS / link).exists(), f'{name}: {link}')
         self.assertEqual(
@@ -412,10 +364,9 @@ class SiteTest(absltest.TestCase):
         pages = {path.relative_to(DOCS).as_posix() for path in tracked_pages()}
         pages |= {*generate.site_pages()}
         for page in pages:
-            listed |= {
-                f'{(DOCS / page).parent.joinpath(below).resolve().relative_to(DOCS)}'
-                for below in conf.navigation(page.removesuffix('.md')).splitlines()[3:-1]
-            }
+            folder = (DOCS / page).parent
+            for below in conf.navigation(page.removesuffix('.md')).splitlines()[3:-1]:
+                listed.add(folder.joinpath(below).resolve().relative_to(DOCS).as_posix())
         self.assertEqual(pages - listed - {'README.md', 'index.md'}, set())
 
 
