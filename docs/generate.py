@@ -30,7 +30,7 @@ from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
-from trl_suite.tasks.variation import sensors, worlds
+from trl_suite.tasks.variation import pushes, sensors, worlds
 from trl_suite.util import files
 
 DOCS = pathlib.Path(__file__).resolve().parent
@@ -438,7 +438,7 @@ def speeds() -> dict[str, Any]:
 def option_tables() -> dict[str, str]:
     """Returns the tables of the options of worlds, pushes and sensors."""
     configs = {
-        'randomize': worlds.WorldConfig, 'push': worlds.PushConfig, 'sensors': sensors.SensorConfig,
+        'randomize': worlds.WorldConfig, 'push': pushes.PushConfig, 'sensors': sensors.SensorConfig,
     }  # fmt: skip
     return {
         f'options of {name}': describe.markdown([options.table_of(config)])

@@ -23,7 +23,8 @@ from helpers import STEP_WEIGHTS as WEIGHTS
 from imitation_test import begin_at
 
 from trl_suite import motion, suite
-from trl_suite.tasks.footsteps.planner import Plans, Pushes, StraightPlans
+from trl_suite.tasks.footsteps.planner import Plans, StraightPlans
+from trl_suite.tasks.variation.pushes import PushConfig
 from trl_suite.vector import VectorEnvironment
 
 PLANAR = 'PD_Biped2D_LLC_Flat_Step-v0'
@@ -622,20 +623,29 @@ class PushTest(parameterized.TestCase):
     """Forces on the torso."""
 
     def test_pushes(self):
-        options = {'force': (80, 80), 'duration': (0.2, 0.2), 'interval': (0.5, 0.5)}
+        options = {'force': 80, 'duration': 0.2, 'interval': 0.5}
         environment, _ = started(pushes=options)
-        torso = environment.physics.model.ptr.body('biped3d_mocap/torso').id
-        pushed = []
+        impulses = []
         for _ in range(60):
             held(environment)
-            force = environment.physics.data.xfrc_applied[torso]
-            pushed.append(bool(force.any()))
-            if pushed[-1]:
-                self.assertAlmostEqual(np.linalg.norm(force), 80, delta=1e-9)
-                np.testing.assert_array_equal(force[2:], 0)
+            impulses.append(environment.info['impulse'])
         # 15 steps without, 6 with, from the start on.
-        expected = ([False] * 15 + [True] * 6) * 2 + [False] * 15 + [True] * 3
-        np.testing.assert_array_equal(pushed, expected)
+        expected = ([0] * 15 + [80 / 30] * 6) * 2 + [0] * 15 + [80 / 30] * 3
+        np.testing.assert_allclose(np.linalg.norm(impulses, axis=1), expected, atol=1e-9)
+        np.testing.assert_array_equal(np.array(impulses)[:, 2], 0)
+
+    def test_pushes_are_those_of_randomize(self):
+        """Of the torso, with the same draws."""
+        push = {'speed': (0.1, 0.5), 'duration': (0.1, 0.3), 'interval': (0.1, 0.3)}
+        pushed = {'randomize': {'push': {**push, 'body': 'torso'}}}, {'pushes': push}
+        first, second = (started(**options)[0] for options in pushed)
+        for _ in range(30):
+            held(first), held(second)
+            np.testing.assert_array_equal(first.physics.data.qpos, second.physics.data.qpos)
+            np.testing.assert_array_equal(first.info['impulse'], second.info['impulse'])
+        self.assertEqual(first.task.config.pushes, None)
+        defaults = started(pushes={})[0].task.config.pushes
+        self.assertEqual((defaults.force, defaults.duration), ((50, 150), (0.2, 0.4)))
 
 
 class MarkerTest(parameterized.TestCase):
@@ -691,7 +701,8 @@ class OptionTest(parameterized.TestCase):
     def test_options_as_objects(self):
         straight, plans = StraightPlans(length=(0.3, 0.6)), Plans(length=(0.3, 0.6), sharp=0.0)
         self.assertIs(started(PLANAR, plans=straight)[0].task.plans, straight)
-        self.assertIs(started(plans=plans, pushes=Pushes())[0].task.plans, plans)
+        environment, _ = started(plans=plans, pushes=PushConfig(force=90.0))
+        self.assertIs(environment.task.plans, plans)
         with self.assertRaises(AttributeError):
             plans.turn = 1.0
         plans = Plans.parse('plans', {'length': 0.5, 'width': np.array([0, 0.2])})

@@ -23,7 +23,7 @@ from trl_suite import suite
 from trl_suite.environments import states
 from trl_suite.registry import catalogue
 from trl_suite.registry.task_types import TASK_TYPES
-from trl_suite.tasks.variation import sensors, worlds
+from trl_suite.tasks.variation import pushes, sensors, worlds
 from trl_suite.vector import VectorEnvironment
 
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '200'))
@@ -143,7 +143,7 @@ def _sensor(name, value):
 DISTURBANCES = [  # option of the task, option in it, and a function that makes its value
     (kind, option.name, make)
     for kind, config, make in (
-        ('randomize', worlds.WorldConfig, _world), ('randomize', worlds.PushConfig, _push),
+        ('randomize', worlds.WorldConfig, _world), ('randomize', pushes.PushConfig, _push),
         ('sensors', sensors.SensorConfig, _sensor),
     )
     for option in dataclasses.fields(config)

@@ -11,7 +11,7 @@ from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
 from trl_suite.bodies.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.variation import CommonOptions, additions, sensors, worlds
+from trl_suite.tasks.variation import CommonOptions, additions, pushes, sensors, worlds
 from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
 
@@ -43,7 +43,7 @@ def disturbances(actuation: str, blocks: Iterable[Block]) -> Iterator[Section]:
         'Each is a number, or two bounds between which it is drawn at the start of an episode.',
         table_of(worlds.WorldConfig),
         'Options of push, in randomize:',
-        table_of(worlds.PushConfig),
+        table_of(pushes.PushConfig),
         _presets('randomize', worlds.PRESETS),
     )
     yield section(

@@ -22,8 +22,6 @@ _GROUPS = '3.17.'  # versions with `mj_setConstGroups`
 _TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 # The warnings of bad position, velocity and acceleration have consecutive numbers.
 _BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-_NUMBER = 8  # bytes
-_FORCE_STRIDE = 6 * _NUMBER  # of `xfrc_applied`, which has force and torque of each body
 _WARNING_STRIDE = 8  # bytes; mjWarningStat has two ints, the second of which is the counter
 
 
@@ -175,7 +173,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     """
     model, data = engine.models[i], engine.data[i]
     arrays_to_physics(i, engine)
-    pushed = begin_push(i, nstep, engine, engine.pushes)
+    pushes.push(i, engine.time[i], nstep * engine.timestep, engine.pushes)
     if not step_motors(i, nstep, engine, engine.motors):
         call(engine.functions[STEP2], model, data)
         for _ in range(nstep - 1):
@@ -184,37 +182,8 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     for _ in range(nstep):  # one addition per step, for the same rounding as in MuJoCo
         engine.time[i] += engine.timestep
     engine.steps[i] += nstep
-    if pushed:
-        end_push(i, engine.pushes)
+    pushes.release(i, engine.pushes)
     physics_to_arrays(i, engine)
-
-
-# Numba leaves out what follows a return for an argument that is None, and so compiles neither pushes
-# nor motors for an engine without.
-
-
-@compiled
-def begin_push(i: int, nstep: int, engine: Engine, given: pushes.Pushes | None) -> bool:
-    """Adds the mean force of a push to the forces on the body; returns whether there is one."""
-    if given is None:
-        return False
-    if not pushes.advance(i, engine.time[i], nstep * engine.timestep, given):
-        return False
-    force, place = given.forces[i] + _FORCE_STRIDE * given.body[0], given.places[i]
-    copy_floats(place, force, 3)
-    for k in range(3):
-        given.scratch[i, 3 + k] += given.scratch[i, k]
-    copy_floats(force, place + 3 * _NUMBER, 3)
-    return True
-
-
-@compiled
-def end_push(i: int, given: pushes.Pushes | None) -> None:
-    """Restores the forces on the body, bit for bit."""
-    if given is None:
-        return
-    force = given.forces[i] + _FORCE_STRIDE * given.body[0]
-    copy_floats(force, given.places[i], 3)
 
 
 @compiled

@@ -55,7 +55,6 @@ class Variation:
 
     Attributes:
       properties: the properties of all simulations; at first the nominal ones.
-      mass: nominal total mass of the links, kg.
     """
 
     def __init__(
@@ -85,7 +84,6 @@ class Variation:
         self._inertia = model.body_inertia[links].copy()
         self._centre = model.body_ipos[links[0]].copy()
         self._damping = model.dof_damping[dofs].copy()
-        self.mass = float(self._mass.sum())
         n, ones = world.n, np.ones(world.n)
         ground = model.geom_friction[self._slides, 0]
         first = self._slides[:1] if len(self._slides) else 0

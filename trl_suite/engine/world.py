@@ -134,15 +134,16 @@ class World:
         self.pack = packed(self.engine)
         return made.state
 
-    def set_pushes(self) -> pushes.Pushes:
-        """Returns pushes, to be filled in, saved and restored; at first there is none.
+    def add_pushes(self) -> int:
+        """Adds a series of pushes to `engine.pushes`, to be filled in; returns its index.
 
         It must be called before a task keeps `engine`.
         """
-        made = pushes.no_pushes(np.array([address(each.xfrc_applied) for each in self._data]))
-        self.engine = self.engine._replace(pushes=made)
+        series = 0 if self.engine.pushes is None else len(self.engine.pushes.body)
+        applied = np.array([address(each.xfrc_applied) for each in self._data])
+        self.engine = self.engine._replace(pushes=pushes.no_pushes(applied, series + 1))
         self.pack = packed(self.engine)
-        return made
+        return series
 
     # Methods for tasks; env_ids are sorted indices of simulations, without repeats. Those that do not
     # exist raise an IndexError.

@@ -63,9 +63,11 @@ def _plans(task: Any) -> list[str]:
         lines.append(
             f'with probability {plans.from_root:g} the plan is relative to position and heading of the root'
         )
-    if task.pushes:
-        low, high = task.pushes.force
-        lines.append(f'the torso is pushed repeatedly with {low:g} to {high:g} N')
+    push = task.config.pushes
+    if push is not None:
+        (low, high), unit = (push.speed, 'm/s') if push.force is None else (push.force, 'N')
+        body = push.body or 'torso'
+        lines.append(f'the {body} is pushed repeatedly with {low:g} to {high:g} {unit}')
     return lines
 
 

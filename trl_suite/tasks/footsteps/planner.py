@@ -77,23 +77,6 @@ class Plans(Config):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Pushes(Config):
-    """Repeated horizontal forces on the torso's centre of mass, in random directions.
-
-    Times are rounded to control steps.
-    """
-
-    force: Range = option(Range(50.0, 150.0), 'force', unit='N', at_least=0)
-    duration: Range = option(Range(0.2, 0.4), 'duration of a push', unit='s', at_least=0)
-    interval: Range = option(
-        Range(1.0, 2.0),
-        'time from the end of a push, or the start of the episode, to the next push',
-        unit='s',
-        at_least=0,
-    )
-
-
 class Planner:
     """Draws the footstep plans of all simulations.
 

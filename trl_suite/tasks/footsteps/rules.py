@@ -49,8 +49,6 @@ class FootstepState(NamedTuple):
       turned: rotation of the reference about z, rad.
       shift: position of the origin of its track, (n, 2) m.
       goal: position of the goal, (n, 3) m.
-      push: force on the torso, (n, 3) N.
-      push_end, push_begin: control steps of an episode at which the push ends and the next begins.
       excused: control step of an episode until which landing errors do not count.
       missed: whether the landing error was too large in the last step.
     """
@@ -61,9 +59,6 @@ class FootstepState(NamedTuple):
     turned: np.ndarray = REAL
     shift: np.ndarray = POINT
     goal: np.ndarray = PLACE
-    push: np.ndarray = PLACE
-    push_end: np.ndarray = WHOLE
-    push_begin: np.ndarray = WHOLE
     excused: np.ndarray = WHOLE
     missed: np.ndarray = FLAG
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,6 @@ from trl_suite.tasks.footsteps.planner import (
     MAX_LANDING_ERROR,
     Planner,
     Plans,
-    Pushes,
     StraightPlans,
 )
 from trl_suite.tasks.footsteps.rules import (
@@ -56,8 +55,11 @@ from trl_suite.tasks.footsteps.rules import (
 )
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking import TrackingTask
+from trl_suite.tasks.variation.pushes import PushConfig, Pushes
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import Range, option
+
+PUSHES = {'force': (50.0, 150.0), 'duration': (0.2, 0.4), 'interval': (1.0, 2.0)}  # defaults
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,8 +79,10 @@ class SpatialFootstepsConfig(MirroredConfig):
 
     plans: Plans = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
     goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
-    pushes: Pushes | None = option(
-        None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
+    pushes: PushConfig | None = option(
+        None,
+        'pushes of the torso, or of another body: a mapping of options of push, as in randomize, but by '
+        f'default {PUSHES}; None: there are none',
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     grace_period: float = option(
@@ -100,6 +104,9 @@ class SpatialFootstepsConfig(MirroredConfig):
     )
 
     def __post_init__(self) -> None:
+        if isinstance(self.pushes, Mapping):
+            replaced = {'force': None} if 'speed' in self.pushes else {}
+            self._set('pushes', {**PUSHES, **replaced, **self.pushes})
         super().__post_init__()
         if self.hidden_plan and self.mirrored:
             raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
@@ -115,7 +122,6 @@ class Footsteps(Planned, TrackingTask):
 
     ABOUT = 'root'
     plans: Any  # Plans or StraightPlans
-    pushes: Pushes | None = None
     goal_given = hidden_plan = False
     _grace_steps = 0
 
@@ -170,15 +176,9 @@ class Footsteps(Planned, TrackingTask):
         plan.stance[env_ids] = self.phase[env_ids] >= 0.5
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
-        state.push_end[env_ids] = state.excused[env_ids] = 0
-        if self.pushes:
-            for i in env_ids.tolist():
-                state.push_begin[i] = self._steps_within(i, self.pushes.interval)
+        state.excused[env_ids] = 0
         self._planner.begin(env_ids, self.travel.origin[env_ids], measurement)
         align_all(env_ids, self._first_tracks(env_ids), self._pack)
-
-    def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
-        return round(self._random[i].uniform(*seconds) / self.control_timestep)
 
     @abc.abstractmethod
     def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
@@ -238,7 +238,7 @@ class SpatialFootsteps(Footsteps):
           ValueError: incompatible options, or steps that do not fit the character.
         """
         check_two_feet(character.spec)
-        self.plans, self.pushes, self.steps = config.plans, config.pushes, steps
+        self.plans, self.steps = config.plans, steps
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
         self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
         # Episodes start from the straight step whose length is nearest to the planned one.
@@ -254,10 +254,9 @@ class SpatialFootsteps(Footsteps):
             extras=(CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)),
             hidden=('contact', 'plan') if config.hidden_plan else (),
         )
-
-    def bind(self, world: World) -> None:
-        super().bind(world)
-        self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
+        if config.pushes is not None:
+            body = config.pushes.body or character.spec.links[1]  # the torso
+            self.add(Pushes(dataclasses.replace(config.pushes, body=body)))
 
     def _track(self) -> Reference:
         return Reference.of_steps(self.steps, self.figure, self.world.models[0])
@@ -289,21 +288,13 @@ class SpatialFootsteps(Footsteps):
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         super().apply_action(action, env_ids)
-        if self.pushes:
-            self._push(env_ids, self.pushes)
-
-    def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
-        """Draws pushes that begin, and applies the forces."""
-        state, count = self.state, self.clock.steps
-        for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
-            angle = self._random[i].uniform(-np.pi, np.pi)
-            force = self._random[i].uniform(*pushes.force)
-            state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
-            state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
-            state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
-            state.excused[i] = state.push_end[i] + self._grace_steps
-        pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
-        self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
+        pushes = self.world.engine.pushes
+        if pushes is not None:  # landing errors do not count during these, and the grace after them
+            begin, end = pushes.state.begin[env_ids], pushes.state.end[env_ids]
+            due = begin < self.world.time[env_ids, None] + self.control_timestep
+            until = np.rint(np.where(due, end, 0.0).max(1) / self.control_timestep)
+            pushed = due.any(1)
+            self.state.excused[env_ids[pushed]] = until[pushed] + self._grace_steps
 
     def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
         feet = measurement.feet[env_ids]

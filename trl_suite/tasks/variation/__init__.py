@@ -22,6 +22,7 @@ from trl_suite.tasks.component import Component
 from trl_suite.tasks.variation import additions
 from trl_suite.tasks.variation import levels as level
 from trl_suite.tasks.variation.motors import Motors
+from trl_suite.tasks.variation.pushes import Pushes
 from trl_suite.tasks.variation.sensors import SensorConfig, Sensors
 from trl_suite.tasks.variation.worlds import WorldConfig, Worlds
 from trl_suite.util.options import Config, option
@@ -84,5 +85,7 @@ def components(
         yield additions.additions(added)
     if options.randomize is not None:
         yield Worlds(options.randomize)
+        if options.randomize.push is not None:
+            yield Pushes(options.randomize.push)
     if options.sensors is not None:
         yield Sensors(options.sensors)

@@ -1,7 +1,7 @@
-"""Worlds that vary between episodes, and pushes: options, draws, and the component.
+"""Worlds that vary between episodes: options, draws, and the component.
 
 Each property is drawn at the beginning of an episode, uniformly between two bounds, and stays
-constant until the next one; pushes are drawn one after the other.
+constant until the next one.
 """
 
 from __future__ import annotations
@@ -14,18 +14,13 @@ from typing import Any
 import numpy as np
 
 from trl_suite.engine import World
-from trl_suite.engine.pushes import DIRECTION, DURATION, FORCE, INTERVAL
-from trl_suite.engine.pushes import draw as draw_push
 from trl_suite.engine.variation import Properties, Variation
-from trl_suite.tasks.component import PUSH, WORLD, Component, seeded, spawned
+from trl_suite.tasks.component import WORLD, Component, spawned
 from trl_suite.tasks.rewards import Outcome
-from trl_suite.tasks.task import Marker, Task
-from trl_suite.util import errors
-from trl_suite.util.compiled import compiled
+from trl_suite.tasks.task import Task
+from trl_suite.tasks.variation.pushes import PushConfig
 from trl_suite.util.options import Config, Range, option
 
-PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
-_METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
 # Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
 # robots are trained: friction 0.5 to 1.25 and changes of velocity of up to 1 m/s every 15 s in
 # legged_gym (`legged_robot_config.py`; Rudin et al. 2022, 'Learning to walk in minutes using
@@ -49,38 +44,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         'push': {'speed': (0.3, 1.0), 'duration': (0.1, 0.3), 'interval': (2.0, 4.0)},
     },
 }  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PushConfig(Config):
-    """Options of pushes: horizontal forces on a link, at its centre of mass."""
-
-    force: Range | None = option(None, 'force', unit='N', at_least=0, at_most=1e6)
-    speed: Range | None = option(
-        None,
-        "impulse over the character's nominal mass, instead of a force: the change of velocity of a "
-        'free body',
-        unit='m/s', at_least=0, at_most=100,
-    )  # fmt: skip
-    duration: Range = option(Range(0.2, 0.2), 'duration', unit='s', at_least=0.001, at_most=1000)
-    interval: Range = option(
-        Range(2.0, 4.0),
-        'time from the end of a push, or the start of the episode, to the next push',
-        unit='s', at_least=0, at_most=1e6,
-    )  # fmt: skip
-    direction: Range = option(
-        Range(-math.pi, math.pi),
-        'direction, to the left of +x; planar characters are pushed along +x if its cosine is positive, '
-        'otherwise along -x',
-        unit='rad', at_least=-2 * math.pi, at_most=2 * math.pi,
-    )  # fmt: skip
-    body: str | None = option(None, 'link that is pushed; by default the root')
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.force is None) == (self.speed is None):
-            given = 'neither' if self.force is None else 'both'
-            raise ValueError(f'push has {given} force and speed; expected one of them')
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -207,10 +170,9 @@ def direction(first: float, second: float, spatial: bool) -> np.ndarray:
 
 
 class Worlds(Component):
-    """Properties of the world that vary between episodes, and pushes.
+    """Properties of the world that vary between episodes.
 
-    `info` has 'world', the drawn properties by name, and with pushes 'impulse', that of the last
-    step, (n, 3) N s.
+    `info` has 'world', the drawn properties by name.
 
     Attributes:
       variation: the properties, after `bind`.
@@ -219,7 +181,7 @@ class Worlds(Component):
     variation: Variation
 
     def __init__(self, config: WorldConfig) -> None:
-        self._config, self._push = config, config.push
+        self._config = config
 
     def added_to(self, task: Task) -> None:
         _check(task, self._config)
@@ -228,10 +190,6 @@ class Worlds(Component):
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {'randomize': (str(self._config.changed), self._config)}
-
-    def prepare(self, world: World) -> None:
-        if self._push is not None:
-            self._pushes = world.set_pushes()
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         task: Any = self.task
@@ -245,71 +203,18 @@ class Worlds(Component):
         self.info_arrays = {
             'world': {name: getattr(properties, name) for name in self._config.varied}
         }
-        if self._push is not None:
-            pushes, push = self._pushes, self._push
-            pushes.ranges[FORCE] = push.speed if push.force is None else push.force
-            pushes.ranges[DURATION], pushes.ranges[INTERVAL] = push.duration, push.interval
-            pushes.ranges[DIRECTION], pushes.planar[0] = push.direction, not spatial
-            pushes.mass[0] = self.variation.mass if push.force is None else 0.0
-            links = task.character.spec.links
-            pushes.body[0] = figure.links[0 if push.body is None else links.index(push.body)]
-            self.saved = properties, pushes.state
-            self.info_arrays['impulse'] = pushes.state.impulse
-            self._steps = np.zeros(world.n, int)
         return outcome
 
     def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        world = self.task.world
         for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
             draw(
                 env_id, self._config, np.random.default_rng(spawned(seed, WORLD)), self._spatial,
                 self.variation.properties,
             )  # fmt: skip
             self.variation.apply(env_id)
-            if self._push is not None:
-                state = self._pushes.state
-                seeded(env_id, spawned(seed, PUSH), state.stream)
-                state.impulse[env_id] = 0.0
-                first_push(np.array([env_id]), world.pack)
-
-    def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        if self._push is not None:
-            self._pushes.state.impulse[env_ids] = 0.0
-            self._steps[env_ids] = self.task.world.engine.steps[env_ids]
-
-    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if self._push is None or fresh:
-            return
-        if (self.task.world.engine.steps[env_ids] == self._steps[env_ids]).any():
-            raise RuntimeError(
-                'a plain composer.Environment has no pushes: use '
-                'trl_suite.environments.environment.Environment'
-            )
 
     def restored(self, env_id: int) -> None:
         self.variation.apply(env_id)
-
-    def markers(self, env_id: int) -> list[Marker]:
-        """Returns an arrow for a push."""
-        if self._push is None:
-            return []
-        world, pushes = self.task.world, self._pushes
-        time = world.time[env_id]
-        if not pushes.state.begin[env_id] <= time < pushes.state.end[env_id]:
-            return []
-        x, y, _ = pushes.state.force[env_id]
-        length = max(_METRES_PER_NEWTON * float(np.hypot(x, y)), 0.1)
-        yaw = float(np.arctan2(y, x))
-        place = world.xipos[env_id, pushes.body[0]].copy()
-        place[:2] -= (length + 0.15) * np.array([np.cos(yaw), np.sin(yaw)])
-        return [Marker('arrow', place, (0.03, 0.03, length), PUSH_COLOUR, yaw)]
-
-
-@compiled
-def first_push(env_ids: np.ndarray, engine: Any) -> None:
-    """Draws the first push of episodes, which begin at time 0; takes the pack of a world."""
-    for i in env_ids:
-        draw_push(i, 0.0, engine.pushes)
 
 
 def _check(task: Task, world: WorldConfig) -> None:
@@ -329,5 +234,3 @@ def _check(task: Task, world: WorldConfig) -> None:
             'slope_direction is for three-dimensional characters; planar ones move along x, so that '
             'slope alone, positive or negative, is enough'
         )
-    if world.push is not None and world.push.body not in (None, *spec.links):
-        raise ValueError(errors.unknown('link in push: body', world.push.body, spec.links))
