@@ -1,4 +1,4 @@
-"""Tells users what a long wait is for: which functions are compiled, and how long that takes.
+"""Tells users what a long wait is for: which functions are compiled.
 
 There is one line when compiling begins, and one when it is over; none for code that is loaded from
 the cache. They go to stderr, whatever that is: a terminal, the output of a notebook, a log. A program
@@ -7,18 +7,12 @@ that shows them elsewhere, too, adds a function of the text to `listeners`; with
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import json
 import os
-import pathlib
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-
-from trl_suite.util import files
-from trl_suite.util.compiled import cache_folder
 
 PATIENCE = 0.5  # s; of less compiling nothing is said
 PAUSE = 2.0  # s without compiling, after which it is over
@@ -44,8 +38,6 @@ class Compiling:
     """What is compiled in this process, for one environment after another."""
 
     def __init__(self) -> None:
-        self._seconds: dict[str, float] = {}  # by environment, in this process
-        self._past: dict[str, float] | None = None  # the same, in an earlier one
         self._subject = ''
         self.begin_anew()
 
@@ -101,14 +93,10 @@ class Compiling:
                 return
             self._told = True
             what = f'functions of {self._subject}' if self._subject else 'functions'
-            if self._past is None:
-                self._past = _known()
-            seconds = self._past.get(self._subject)
-            last = EXPECTED if seconds is None else f'it took {seconds:.0f} s the last time'
             if self._waits:
-                _say(f'waiting for another process that compiles {what}; {last}')
+                _say(f'waiting for another process that compiles {what}; {EXPECTED}')
             else:
-                _say(f'compiling {what} for this machine, once; {last}')
+                _say(f'compiling {what} for this machine, once; {EXPECTED}')
 
     def _finish(self) -> None:
         with self._lock:
@@ -117,18 +105,7 @@ class Compiling:
             if self._told:
                 others = f', {self._waited:.0f} s of them by another process'
                 _say(f'compiled in {self._spent:.0f} s{others if self._waited > PATIENCE else ""}')
-            self.keep()
             self._spent, self._waited, self._told = 0.0, 0.0, False
-
-    def keep(self) -> None:
-        """Writes down how long it took, if it was told of."""
-        folder = cache_folder() if self._told else None
-        if folder is None:
-            return
-        self._seconds[self._subject] = self._seconds.get(self._subject, 0.0) + self._spent
-        rounded = round(self._seconds[self._subject], 1)
-        with contextlib.suppress(OSError):
-            files.write_json({**_known(), self._subject: rounded}, _record(folder))
 
 
 def _say(text: str) -> None:
@@ -136,21 +113,6 @@ def _say(text: str) -> None:
         listener(text)
 
 
-def _record(folder: pathlib.Path) -> pathlib.Path:
-    return folder.parent / 'seconds.json'
-
-
-def _known() -> dict[str, float]:
-    """Returns how long compiling took the last time, s, by environment."""
-    folder = cache_folder()
-    try:
-        known = json.loads(_record(folder).read_text(encoding='utf-8')) if folder else {}
-        return {str(subject): float(seconds) for subject, seconds in known.items()}
-    except (OSError, ValueError, AttributeError, TypeError):  # none, or a damaged one
-        return {}
-
-
 compiling = Compiling()
-atexit.register(compiling.keep)
 if hasattr(os, 'register_at_fork'):
     os.register_at_fork(after_in_child=compiling.begin_anew)
