@@ -2,5 +2,3 @@
 
 from trl_suite.arenas.planar import PlanarArena
 from trl_suite.arenas.spatial import SpatialArena
-
-__all__ = ('PlanarArena', 'SpatialArena')
