@@ -52,67 +52,50 @@ FAMILIES = (
     'PD_Biped2D_LLC_Flat_Step-v0', 'PD_Biped3D_HLC_DynamicsObstacles-v0', 'PD_Biped3D_HLC_Soccer-v0',
     'PD_Biped3D_Terrain_Forest_Hard-v0', 'PD_Biped3D_Terrain_Soccer_Hard-v0',
 )  # fmt: skip
-OPTIONS = {  # an id, or the arguments of `suite.combine` -> options
-    'PD_Biped2D_Gaps_Terrain-v0': (
-        {'terrain_observation': 0}, {'terrain_observation': 20, 'reference_observation': True}, {'substeps': 4},
-        {'action_offset': 'posture'}, {'action_offset': 'original'}, {'action_scale': 0.7}, {'start_phase': 0.25},
-        {'start_phase': ((0.1, 0.2), (0.6, 0.9))}, {'spawn': 'upstream'}, {'time_limit': 0.3},
-    ),
-    'PD_Dog2D_Slopes_Mixed_Terrain-v0': ({'reference_observation': True}, {'terrain_observation': 100}),
-    'PD_Raptor2D_Steps_Terrain-v0': ({'action_offset': 'posture', 'reference_observation': True},),
-    'MTU_Biped2D_LLC_Imitate_Flat-v0': ({'reference_observation': False}, {'terrain_observation': 50}),
-    'MTU_Raptor2D_LLC_Imitate_Flat-v0': ({'muscle_set': 'run'}, {'substeps': 20}),
-    'Torque_Dog2D_LLC_Imitate_Flat-v0': ({'reference_observation': False, 'terrain_observation': 10},),
-    'Vel_Biped2D_LLC_Imitate_Flat-v0': ({'reference_observation': False}, {'substeps': 10, 'start_phase': 0.0}),
-    'FSM_Dog2D_Terrain_Mixed-v0': (
-        {'interface': 'base_action'}, {'substeps': 4}, {'spawn': 'upstream'}, {'start_noise': 0.02},
-    ),
-    'FSM_Biped2D_Terrain_Slopes-v0': ({'interface': 'base_action', 'start_noise': 0.01},),
-    'FSM_Hopper2D_Terrain_Gaps-v0': ({'substeps': 1},),
-    'PD_Biped3D_Imitate-v0': (
-        {'reference_observation': True}, {'mirrored': True}, {'substeps': 20},
-        {'action_offset': 'posture'}, {'action_offset': 'original'}, {'action_scale': 0.7}, {'start_phase': 0.6},
-        {'terrain_observation': 'height'}, {'time_limit': 0.3},
-    ),
-    'PD_Biped3D_Imitate-Stairs-v0': ({'terrain_observation': 'height', 'mirrored': True},),
-    'PD_Biped3D_LLC_General_Step-v0': (
-        {'mirrored': True}, {'plans': {'from_root': 1.0}}, {'plans': {'from_root': 0.5, 'sharp': 0.5}},
-        {'goal': True}, {'max_landing_error': 0.1, 'grace_period': 0.2}, {'footstep_scale': 4.0, 'heading_scale': 2.0},
-        {'pushes': {'force': (80, 120), 'duration': (0.1, 0.3), 'interval': (0.1, 0.3)}},
-        {'terrain_observation': 'height'}, {'start_phase': ((0.0, 0.1), (0.5, 0.6))},
-    ),
-    'PD_Biped3D_LLC_Trail_Step-v0': ({'mirrored': True, 'plans': {'length': (0.3, 0.6)}},),
-    'PD_Biped2D_LLC_Flat_Step-v0': (
-        {'plans': {'length': (0.25, 0.6), 'change': 1.0}, 'max_landing_error': 0.5}, {'terrain_observation': 50},
-        {'footstep_scale': 4.0}, {'start_phase': 0.0, 'substeps': 5},
-    ),
-    'PD_Biped3D_HLC_Forest-v0': (
-        {'goal_distance': (3, 5), 'goal_reached': 2.0}, {'start_phases': (0.0, 0.1, 0.6)},
-        {'step_length': 0.3, 'target_speed': 0.5}, {'terrain_observation': ()}, {'substeps': 20},
-    ),
-    'PD_Biped3D_HLC_DynamicsObstacles-v0': (
-        {'terrain_observation': ('height', 'velocity')}, {'terrain_observation': ('velocity',)},
-        {'interface': 'frame', 'terrain_observation': ('height', 'velocity')},
-    ),
-    'PD_Biped3D_HLC_Soccer-v0': (
-        {'interface': 'frame'}, {'goal_distance': (1, 2)}, {'terrain_observation': ('height',)},
-    ),
-    'PD_Biped3D_Terrain_Trail_Hard-v0': (
-        {'reward': 'original'}, {'terrain_observation': ()}, {'goal_reached': 3.0},
-    ),
-    'PD_Biped3D_Terrain_Soccer_Hard-v0': ({'terrain_observation': 'height', 'goal_reached': 2.0},),
-    ('biped3d', 'torque'): ({}, {'reference_observation': True}),
-    ('biped3d', 'velocity', 'hills3d'): ({},),
-    ('biped3d', 'position', 'conveyor3d_wide'): ({'start_phase': 0.1},),
-    ('biped3d_full_mocap',): ({'action_offset': 'original'},),
-    ('biped3d_mocap', 'position', 'stairs3d', 'footsteps'): ({'terrain_observation': 'height'},),
-    ('biped2d', 'torque', 'gaps', 'walk'): ({'terrain_observation': 50},),
-    ('dog', 'muscle', 'slopes_mixed', 'walk'): ({'terrain_observation': 50},),
-    ('biped3d_full_mocap', 'position', 'hills3d', 'walk'): ({'terrain_observation': 'height'},),
-    ('biped2d', 'muscle', 'gaps_curriculum'): ({'terrain_level': 0.5}, {'terrain_level': 0.9}),
-    ('goat', 'position', 'cliffs_rugged'): ({},),
-    ('raptor', None, 'slopes_blend', 'gait'): ({'terrain_level': 0.3},),
-}  # fmt: skip
+OPTIONS = (  # an id or the arguments of `suite.combine`, options; beside those of state_test
+    ('PD_Biped2D_Gaps_Terrain-v0', {
+        'terrain_observation': 20, 'reference_observation': True, 'substeps': 4, 'action_offset': 'posture',
+        'start_phase': ((0.1, 0.2), (0.6, 0.9)), 'spawn': 'upstream',
+    }),
+    ('PD_Biped2D_Gaps_Terrain-v0', {
+        'terrain_observation': 0, 'action_offset': 'original', 'action_scale': 0.7, 'time_limit': 0.3,
+    }),
+    ('MTU_Biped2D_LLC_Imitate_Flat-v0', {'reference_observation': False, 'terrain_observation': 50}),
+    ('MTU_Raptor2D_LLC_Imitate_Flat-v0', {'muscle_set': 'run', 'substeps': 20}),
+    ('Torque_Dog2D_LLC_Imitate_Flat-v0', {'reference_observation': False, 'terrain_observation': 10}),
+    ('Vel_Biped2D_LLC_Imitate_Flat-v0', {'substeps': 10, 'start_phase': 0.0}),
+    ('FSM_Dog2D_Terrain_Mixed-v0', {'substeps': 4, 'spawn': 'upstream', 'start_noise': 0.02}),
+    ('FSM_Hopper2D_Terrain_Gaps-v0', {'substeps': 1}),
+    ('PD_Biped3D_Imitate-v0', {
+        'reference_observation': True, 'substeps': 20, 'action_offset': 'posture', 'start_phase': 0.6,
+        'action_scale': 0.7, 'terrain_observation': 'height', 'time_limit': 0.3,
+    }),
+    ('PD_Biped3D_LLC_General_Step-v0', {
+        'plans': {'from_root': 0.5, 'sharp': 0.5}, 'footstep_scale': 4.0, 'heading_scale': 2.0,
+        'max_landing_error': 0.1, 'grace_period': 0.2, 'start_phase': ((0.0, 0.1), (0.5, 0.6)),
+        'pushes': {'force': (80, 120), 'duration': (0.1, 0.3), 'interval': (0.1, 0.3)},
+    }),
+    ('PD_Biped2D_LLC_Flat_Step-v0', {
+        'terrain_observation': 50, 'footstep_scale': 4.0, 'start_phase': 0.0, 'substeps': 5,
+    }),
+    ('PD_Biped3D_HLC_Forest-v0', {
+        'goal_distance': (3, 5), 'goal_reached': 2.0, 'start_phases': (0.0, 0.1, 0.6), 'step_length': 0.3,
+        'target_speed': 0.5, 'terrain_observation': (), 'substeps': 20,
+    }),
+    ('PD_Biped3D_HLC_DynamicsObstacles-v0', {'terrain_observation': ('velocity',)}),
+    ('PD_Biped3D_HLC_Soccer-v0', {'goal_distance': (1, 2), 'terrain_observation': ('height',)}),
+    ('PD_Biped3D_Terrain_Trail_Hard-v0', {
+        'reward': 'original', 'terrain_observation': (), 'goal_reached': 3.0,
+    }),
+    ('PD_Biped3D_Terrain_Soccer_Hard-v0', {'terrain_observation': 'height', 'goal_reached': 2.0}),
+    (('biped3d', 'torque'), {'reference_observation': True}), (('biped3d', 'velocity', 'hills3d'), {}),
+    (('biped3d_full_mocap',), {'action_offset': 'original'}),
+    (('biped2d', 'torque', 'gaps', 'walk'), {'terrain_observation': 50}),
+    (('dog', 'muscle', 'slopes_mixed', 'walk'), {'terrain_observation': 50}),
+    (('biped3d_full_mocap', 'position', 'hills3d', 'walk'), {'terrain_observation': 'height'}),
+    (('biped2d', 'muscle', 'gaps_curriculum'), {'terrain_level': 0.5}),
+    (('raptor', None, 'slopes_blend', 'gait'), {'terrain_level': 0.3}),
+)  # fmt: skip
 PARTS = {
     'rewards': {'fast': (0.5, parts.speed), 'lazy': (-0.1, parts.effort)},
     'observations': {'upright': (1, parts.upright), 'rates': (2, lambda t: parts.joint_rates(t)[:, :2])},
@@ -158,7 +141,7 @@ def drawn(name, *shape):
 
 
 def batch(name, environment, n=3, options=None, steps=100):
-    if not isinstance(environment, str):
+    if type(environment) is tuple:
         environment = suite.combine(*environment)
     steps = 9 if is_long(name) else steps
     environments = VectorEnvironment(
@@ -188,18 +171,18 @@ def policy(name, id_):
 
 def all_cases():
     """Returns all cases: functions without arguments by name."""
+    from state_test import VARIANTS  # which the comparison with another engine does not need
+
     listed = [(batch, f'batch/{id_}', id_) for id_ in suite.ALL_IDS]
-    given = {environment: list(variants) for environment, variants in OPTIONS.items()}
-    for character, presets in (('biped2d', terrain.PRESETS), ('biped3d', terrain.PRESETS3D)):
-        for preset in presets:
-            given.setdefault((character, 'position', preset), []).append({})
-    for id_ in FAMILIES:
-        given.setdefault(id_, []).append(PARTS)
-    for environment, variants in given.items():
-        base = environment if isinstance(environment, str) else '/'.join(map(str, environment))
-        for options in variants:
-            name = f'option/{base}/{"parts" if options is PARTS else options}'
-            listed.append((batch, name, environment, 2, options, 40))
+    characters = {'biped2d': terrain.PRESETS, 'biped3d': terrain.PRESETS3D}
+    for environment, options in (
+        *OPTIONS, *(each for each in VARIANTS if 'rewards' not in each[1]),
+        *(((name, 'position', preset), {}) for name, presets in characters.items() for preset in presets),
+        *((id_, PARTS) for id_ in FAMILIES),
+    ):  # fmt: skip
+        base = '/'.join(map(str, environment)) if type(environment) is tuple else environment
+        name = f'option/{getattr(base, "id", base)}/{"parts" if options is PARTS else options}'
+        listed.append((batch, name, environment, 2, options, 40))
     listed += [(policy, f'policy/{id_}', id_) for id_ in policies.available()]
     return {name: lambda f=f, name=name, rest=rest: f(name, *rest) for f, name, *rest in listed}
 
