@@ -263,6 +263,18 @@ class LawTest(parameterized.TestCase):
             np.testing.assert_allclose(torque[env_id], expected, rtol=1e-8, atol=1e-7)
             self.assertEqual(torque[env_id, -1], 0.0)
 
+    def test_solve(self):
+        """Within rounding of LAPACK, pivots included."""
+        rng = np.random.default_rng(0)
+        for n in (1, 4, 23):
+            matrix, vector = rng.normal(size=(3, n, n)), rng.normal(size=(3, n))
+            matrix[1, 0, 0] = 0.0 if n > 1 else 2.0
+            others, expected = matrix[[0, 2]].copy(), np.linalg.solve(matrix[1], vector[1])
+            bound = 1e-15 * np.linalg.cond(matrix[1]) * np.abs(expected).max()
+            dynamics.solve(1, n, matrix, vector)
+            np.testing.assert_allclose(vector[1], expected, rtol=0, atol=bound)
+            np.testing.assert_array_equal(matrix[[0, 2]], others)
+
     def test_world_angles_are_wrapped(self):
         rig = Rig('raptor')
         q = np.zeros((1, len(rig.rules.skeleton.dof)))

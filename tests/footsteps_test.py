@@ -65,6 +65,13 @@ def heading(task):
     return getattr(task.plan, 'heading', np.zeros(task.world.n)).copy()
 
 
+def length_and_width(start, end, headings, foot):
+    """Of steps of a foot between places (n, 3) m, along headings (n,), 2 arrays (n,) m."""
+    x, y = (end - start)[:, :2].T
+    cosine, sine = np.cos(headings), np.sin(headings)
+    return cosine * x + sine * y, SIDE[foot] * (cosine * y - sine * x)
+
+
 def walked(n, switches, id_=GENERAL, **options):
     """The plans of n walkers that stand still while their clocks run: distributions of plans.
 
@@ -200,11 +207,8 @@ class PlanTest(parameterized.TestCase):
             np.testing.assert_array_equal(after[:, 0], landing[:, 1])
             if id_ == RUN:  # it goes straight on
                 np.testing.assert_array_equal((before, headings), 0)
-            for env_id in range(4):
-                way = (
-                    flattened(headings[env_id])[:2, :2] @ (after[env_id, 1] - after[env_id, 0])[:2]
-                )
-                np.testing.assert_allclose(way, [length, SIDE[stance] * width], atol=1e-9)
+            found = length_and_width(after[:, 0], after[:, 1], headings, stance)
+            np.testing.assert_allclose(found, [[length] * 4, [width] * 4], atol=1e-9)
             stances.append(stance)
         self.assertEqual(stances, [LEFT, RIGHT] * 6)
 
@@ -227,22 +231,13 @@ class PlanTest(parameterized.TestCase):
             self.assertAlmostEqual(found.mean(), probability, delta=4 * deviation)
         self.assertAlmostEqual(turns[~far].mean(), 0, delta=0.12 * turn)
 
-    def ways(self, found):
-        """Lengths and widths of the planned steps, (switches, n) each."""
-        lengths, widths = [], []
-        for _, _, after, headings, stance in found:
-            x, y = (after[:, 1] - after[:, 0])[:, :2].T
-            cosine, sine = np.cos(headings), np.sin(headings)
-            lengths.append(cosine * x + sine * y)
-            widths.append(SIDE[stance] * (cosine * y - sine * x))
-        return np.array(lengths), np.array(widths)
-
     @parameterized.product(id_=BOTH, change=(0.0, 0.1, 1.0))
     def test_lengths_and_widths(self, id_, change):
         """They are uniform, and change in a share of the steps."""
         widths = {'width': (0.1, 0.25)} if id_ == GENERAL else {}
         _, found = walked(60, 16, id_, plans={'length': (0.25, 0.6), 'change': change, **widths})
-        lengths, widths = self.ways(found)
+        sizes = [length_and_width(a[:, 0], a[:, 1], *more) for _, _, a, *more in found]
+        lengths, widths = np.moveaxis(sizes, 1, 0)
         changed = np.abs(np.diff(lengths, axis=0)) > 1e-9
         deviation = np.sqrt(change * (1 - change) / changed.size)
         self.assertAlmostEqual(changed.mean(), change, delta=4 * deviation)
@@ -257,15 +252,13 @@ class PlanTest(parameterized.TestCase):
     def test_plans_made_from_the_root(self):
         environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
         measured = environments.task.figure.measure()
-        lengths, widths, turns = [], [], []
+        sizes, turns = [], []
         for _, _, after, headings, stance in found:
             turns.append(headings - measured.heading)
-            places = [measured.feet[:, stance, :2], after[:, 0, :2], after[:, 1, :2]]
-            for which, foot in ((0, 1 - stance), (1, stance)):
-                x, y = (places[which + 1] - places[which]).T
-                cosine, sine = np.cos(headings), np.sin(headings)
-                lengths.append(cosine * x + sine * y)
-                widths.append(SIDE[foot] * (cosine * y - sine * x))
+            feet = measured.feet[:, stance]
+            sizes.append(length_and_width(feet, after[:, 0], headings, 1 - stance))
+            sizes.append(length_and_width(after[:, 0], after[:, 1], headings, stance))
+        lengths, widths = np.moveaxis(sizes, 1, 0)
         assert_uniform(lengths, 0.2 - 1e-9, 0.7 + 1e-9)
         assert_uniform(widths, 0.08 - 1e-9, 0.28 + 1e-9)
         turns = np.ravel(turns)
@@ -350,9 +343,8 @@ class GoalTest(parameterized.TestCase):
                 task.goal[0, 2], ground(environment, *task.goal[0, :2]), delta=1e-6
             )
             # The first place is a step from the foot that stands.
-            step = task.plan.landing[0, 0] - feet[RIGHT]
-            step = flattened(heading(task)[0])[:2, :2] @ step[:2]
-            np.testing.assert_allclose(step, [length, 0.15], atol=1e-9)
+            found = length_and_width(feet[[RIGHT]], task.plan.landing[:, 0], heading(task), LEFT)
+            np.testing.assert_allclose(np.ravel(found), [length, 0.15], atol=1e-9)
 
     @parameterized.parameters(
         (GENERAL, 0.7, 0), (GENERAL, 2.0, 0), (TRAIL, 2.0, 0), (GENERAL, None, 5.0)

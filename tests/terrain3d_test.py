@@ -786,6 +786,23 @@ class SurroundingsTest(parameterized.TestCase):
                 found.height(x, y)[env_id], ground.height(x[env_id], y[env_id])
             )
 
+    @parameterized.parameters('pillars3d', 'dynamic_obstacles3d', 'trail3d2')
+    def test_state(self, source):
+        xy = np.array([(9.0, 3.0), (-7.0, 1.0)])
+        found, other = around(source, [0, 1], xy), around(source, [5, 6, 7])
+        for _ in range(50):
+            advance(found, 0.1, xy)
+        other.restore(2, pickle.loads(pickle.dumps(found.state(1))))
+        for part in ('mover_distance', 'mover_direction', 'centre'):
+            restored, expected = getattr(other.arrays, part)[2], getattr(found.arrays, part)[1]
+            np.testing.assert_array_equal(restored, expected)
+        points, env_ids = xy[1] + np.linspace(-8, 8, 50)[:, None], np.array([1])
+        heights = found.height(*points.T[:, None], env_ids)
+        np.testing.assert_array_equal(other.height(*points.T[:, None], env_ids + 1), heights)
+        empty = terrain.Surroundings(1, found.capacity)
+        empty.restore(0, empty.state(0))
+        self.assertIsNone(empty.grounds[0])
+
     @parameterized.parameters('blocks3d', 'pillars3d', 'stairs3d', 'path3d', 'path3d_straight')
     def test_capacity(self, source):
         ground = terrain.load(source)

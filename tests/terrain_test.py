@@ -319,7 +319,7 @@ class FileTest(FolderTest):
     def test_terrain_level_interpolates(self):
         ground = terrain.load('gaps_curriculum')
         for terrain_level, low, high in (
-            (0, 0.1, 0.25), (0.5, 0.3, 0.875), (1, 0.5, 1.5), (-3, 0.1, 0.25), (7, 0.5, 1.5),
+            (0, 0.1, 0.25), (0.25, 0.2, 0.5625), (1, 0.5, 1.5), (-3, 0.1, 0.25), (7, 0.5, 1.5),
         ):  # fmt: skip
             values = ground.parameters(terrain_level)
             self.assertAlmostEqual(values['GapWMin'], low)
