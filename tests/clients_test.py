@@ -9,7 +9,6 @@ import pathlib
 import re
 import runpy
 import sys
-import tempfile
 import unittest
 from unittest import mock
 
@@ -17,6 +16,8 @@ import gymnasium
 import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
+from helpers import FolderTest
+from programs import output
 
 import trl_suite.gym
 from trl_suite import sequences, suite
@@ -34,16 +35,12 @@ def needs(module, extra):
     )
 
 
-def output(name, *arguments):
+def run_example(name, *arguments):
     """Runs an example as a program in this process; returns what it printed."""
-    out = io.StringIO()
-    with (
-        contextlib.redirect_stdout(out),
-        mock.patch.object(sys, 'argv', [name, *arguments]),
-        mock.patch.object(program, 'begin_script'),  # it is for processes of their own
-    ):
-        runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
-    return out.getvalue()
+    with mock.patch.object(program, 'begin_script'):  # it is for processes of their own
+        return output(
+            lambda: runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__'), *arguments
+        )
 
 
 def run_page(word):
@@ -66,7 +63,7 @@ def load(name):
 
 class GymnasiumTest(absltest.TestCase):
     def test_example_runs(self):
-        out = output('gymnasium_rollout')
+        out = run_example('gymnasium_rollout')
         self.assertRegex(out, r'^one: return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
         # Random actions fell a walker within a second or so: 16 simulations of 256 steps.
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
@@ -79,10 +76,10 @@ class GymnasiumTest(absltest.TestCase):
 
 
 @needs('stable_baselines3', 'sb3')
-class StableBaselinesTest(absltest.TestCase):
+class StableBaselinesTest(FolderTest):
     @pytest.mark.slow
     def test_example_runs(self):
-        out = output('stable_baselines_ppo', '--samples', '40960', '--every', '4096')
+        out = run_example('stable_baselines_ppo', '--samples', '40960', '--every', '4096')
         returns = [float(line.split()[1]) for line in out.splitlines()[1:]]
         self.assertGreater(max(returns), returns[0] + 4)
 
@@ -90,7 +87,7 @@ class StableBaselinesTest(absltest.TestCase):
     def test_learners_of_sequences(self):
         """The second stage of PLAiD takes samples on both terrains."""
         sequence = sequences.Sequence('two', ('PD_Biped2D_Flat_Terrain-v0', GAPS))
-        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
+        self.enterContext(contextlib.chdir(self.folder))
         for name, kind, expected in (
             ('continual_learning', 'FineTuning', [[4096, 0], [0, 4096]]),
             ('plaid', 'Plaid', [[4096, 0], [320, 2048 + 320]]),
@@ -169,7 +166,7 @@ class TorchRLTest(parameterized.TestCase):
 
     @pytest.mark.slow
     def test_example_runs(self):
-        out = output('torchrl_ppo', '--samples', '24576')
+        out = run_example('torchrl_ppo', '--samples', '24576')
         returns = [float(found) for found in re.findall(r'return +([\d.]+)\n', out)]
         self.assertLen(returns, 12)
         self.assertGreater(np.mean(returns[-3:]), 1.2 * np.mean(returns[:3]))
@@ -193,7 +190,7 @@ class ShimmyTest(parameterized.TestCase):
             np.testing.assert_array_equal(block, expected[name])
 
     def test_example_runs(self):
-        out = output('shimmy_rollout')
+        out = run_example('shimmy_rollout')
         self.assertRegex(out, r'^return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
         self.assertEndsWith(out, 'picture of shape (240, 320, 3)\n')
 
@@ -233,7 +230,3 @@ class RLlibTest(absltest.TestCase):
             np.testing.assert_array_equal(state['seeds'], expected)
             self.assertGreater(state['steps'].sum(), 16)
         self.assertFalse(np.array_equal(*(state['world'][0] for state in states)))
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -2,33 +2,27 @@
 
 import concurrent.futures
 import dataclasses
+import functools
 import json
 import pickle
 from unittest import mock
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
+from helpers import assert_refused
+from programs import GAPS, policy_for
 
-from trl_suite import evaluation, policies, suite
+from trl_suite import evaluation, suite
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
-GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
-FLAT = 'PD_Biped2D_Flat_Terrain-v0'
+FLAT, RAPTOR = 'PD_Biped2D_Flat_Terrain-v0', 'PD_Raptor2D_LLC_Imitate_Flat-v0'
+GAIT = 'FSM_Biped2D_Terrain_Gaps-v0'
 LISTS = ('seeds', 'returns', 'lengths', 'distances', 'fell')
 
 
-def make(id_, seed=0, scale=0.1):
-    """A policy with random weights that fits an environment."""
-    task, rng = suite.build_task(suite.find(id_)), np.random.default_rng(seed)
-    blocks = [(name, part.stop - part.start) for name, part in task.blocks.items()]
-    k, a = sum(size for _, size in blocks), len(task.action_map)
-    return policies.Policy(
-        id=id_, blocks=blocks, actions=task.action_map.names,
-        quantity=task.action_map.quantity, mean=rng.normal(0, 0.1, k), std=np.ones(k), clip=5.0,
-        weights=[rng.normal(0, scale, (k, 32)), rng.normal(0, scale, (32, a))],
-        biases=[np.zeros(32), np.zeros(a)], activation='tanh', log_std=np.zeros(a),
-    )  # fmt: skip
+def make(id_, seed=0):
+    return policy_for(id_, seed, 0.1, (32,))
 
 
 def alone(id_, seeds, act, **options):
@@ -46,41 +40,33 @@ def alone(id_, seeds, act, **options):
 
 
 class EvaluateTest(parameterized.TestCase):
-    @parameterized.parameters(GAPS, 'PD_Raptor2D_LLC_Imitate_Flat-v0')
-    def test_episodes_are_those_of_single_environments(self, id_):
-        policy = make(id_)
-        found = evaluation.evaluate(id_, policy, episodes=6, seed=4, num_threads=2)
+    @parameterized.parameters(
+        (GAPS, make), (RAPTOR, make), (RAPTOR, evaluation.clip), (GAIT, evaluation.zero),
+    )  # fmt: skip
+    def test_episodes_are_those_of_single_environments(self, id_, policy):
+        """Also of the clip's actions, and where steps differ in duration."""
+        factory, limit = policy is not make, {'step_limit': 12} if id_ == GAIT else {}
+        policy = policy if factory else policy(id_)
+
+        def act(environment, time_step):
+            if policy is evaluation.clip:
+                return np.clip(environment.task.clip_action(0), -1, 1)
+            return np.zeros(28) if factory else policy(time_step.observation)
+
+        spec = dataclasses.replace(suite.find(id_), **limit)
+        found = evaluation.evaluate(spec, policy, 6, 4, num_threads=2, factory=factory)
         self.assertEqual(found['seeds'], VectorEnvironment(id_, 6, 1, seed=4).seeds.tolist())
-        returns, lengths, distances, fell, _ = alone(
-            id_, found['seeds'], lambda environment, time_step: policy(time_step.observation)
-        )
-        self.assertEqual(found['returns'], returns)
-        self.assertEqual(found['lengths'], lengths)
-        self.assertEqual(found['distances'], distances)
-        self.assertEqual(found['fell'], fell)
-        self.assertGreater(
-            len(set(lengths)), 1
-        )  # some simulations continued after others had ended
+        *expected, _ = alone(id_, found['seeds'], act, **limit)
+        self.assertEqual([found[name] for name in LISTS[1:]], expected)
+        if not factory:  # some simulations continued after others had ended
+            self.assertGreater(len(set(found['lengths'])), 1)
 
-    def test_clip_actions_equal_those_of_single_environments(self):
-        id_ = 'PD_Raptor2D_LLC_Imitate_Flat-v0'
-        found = evaluation.evaluate(id_, evaluation.clip, 4, 1, factory=True)
-        returns, lengths, *_ = alone(
-            id_,
-            found['seeds'],
-            lambda environment, _: np.clip(environment.task.clip_action(0), -1, 1),
-        )
-        self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
-
-    def test_steps_of_different_durations(self):
-        """Simulations whose steps differ in duration."""
-        spec = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
-        found = evaluation.evaluate(spec, evaluation.zero, 3, 5, factory=True)
-        returns, lengths, distances, fell, _ = alone(
-            spec.id, found['seeds'], lambda environment, _: np.zeros(28), step_limit=12
-        )
-        self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
-        self.assertEqual((found['distances'], found['fell']), (distances, fell))
+    def test_seeds_may_be_given(self):
+        seeds = [2**31 + 1, 7, 2**32 - 1]
+        found = evaluation.evaluate(GAPS, evaluation.zero, 3, seeds, factory=True)
+        self.assertEqual((found['seeds'], found['seed']), (seeds, None))
+        expected = alone(GAPS, seeds, lambda *_: np.zeros(11))
+        self.assertEqual(found['returns'], expected[0])
 
     def test_results_do_not_depend_on_threads_and_chunks(self):
         policy = make(GAPS)
@@ -114,9 +100,8 @@ class EvaluateTest(parameterized.TestCase):
             for policy, factory in ((make(GAPS), False), (evaluation.random, True)):
                 expected = evaluation.evaluate(GAPS, policy, 7, 2, factory=factory)
                 for executor in (pickling, pool):
-                    found = evaluation.evaluate(
-                        GAPS, policy, 7, 2, factory=factory, executor=executor
-                    )
+                    options = {'factory': factory, 'executor': executor}
+                    found = evaluation.evaluate(GAPS, policy, 7, 2, **options)
                     self.assertEqual(found, expected)
         self.assertLen(pickling.sent, 2 * 3)
         self.assertLess(max(pickling.sent), 1e5)  # a policy, and no environment
@@ -140,9 +125,8 @@ class EvaluateTest(parameterized.TestCase):
         # A step limit that all reach: the rewards of three steps and no fall.
         spec = dataclasses.replace(suite.find(GAPS), step_limit=3)
         found = evaluation.evaluate(spec, make(GAPS), 4)
-        self.assertEqual(
-            (found['completion_rate'], found['falls'], found['lengths']), (1, 0, [3] * 4)
-        )
+        self.assertEqual((found['completion_rate'], found['falls']), (1, 0))
+        self.assertEqual(found['lengths'], [3] * 4)
         self.assertEqual(found['step_limit'], 3)
         self.assertEqual(found['normalized_return'], found['return'] / 3)
         self.assertGreater(found['normalized_return'], 0.3)
@@ -196,16 +180,12 @@ class EvaluateTest(parameterized.TestCase):
             ("seed is 'x'; expected a whole number from 0 to 4294967295", GAPS, policy, 1, ['x']),
             ('seed is 4294967296; expected a whole number', GAPS, policy, 1, [2**32]),
             ('num_threads is -1', GAPS, policy, 1, 0, -1),
+            ('2 seeds for 3 episodes', GAPS, policy, 3, [1, 2]),
             ('did you mean', GAPS[:-1], policy),
             ('unknown option', GAPS, policy, 1, 0, 0, {'x': 1}),
             ('observes terrain 50, .*gives pose', 'PD_Biped2D_Flat-v0', policy, 1),
             (r'actions have shape \(2, 3\)', GAPS, lambda o: np.zeros((len(o), 3)), 2),
         ):
-            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
-                evaluation.evaluate(*arguments)
+            assert_refused(self, (functools.partial(evaluation.evaluate, *arguments), message))
         with self.assertRaisesRegex(ValueError, 'torque control cannot follow a clip'):
             evaluation.evaluate('imitation/torque_dog', evaluation.clip, 1, factory=True)
-
-
-if __name__ == '__main__':
-    absltest.main()

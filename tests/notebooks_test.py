@@ -1,6 +1,7 @@
 """The notebooks in colab/: whole, with outputs, naming what exists; and run again (slow)."""
 
 import ast
+import importlib
 import importlib.util
 import json
 import pathlib
@@ -11,7 +12,7 @@ import types
 from unittest import mock
 
 import pytest
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 
 from trl_suite import terrain
 from trl_suite.registry import catalogue
@@ -23,9 +24,7 @@ NAMES = (
     'continual_learning',
 )  # fmt: skip
 LARGEST = 600e3  # bytes
-EXTRAS = {
-    'trl_suite.adapters.stable_baselines': 'stable_baselines3'
-}  # module -> what it needs beside us
+EXTRAS = {'trl_suite.adapters.stable_baselines': 'stable_baselines3'}  # what a module needs
 _ID = re.compile(r'\b\w[\w-]*-v0\b')
 _FILE = re.compile(r'\b(?:docs|examples|trained|training)/[\w/]+\.\w+')
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
@@ -121,13 +120,20 @@ class StoredTest(parameterized.TestCase):
                     terrain.load(preset)
 
 
+def badges():
+    """The program that marks notebooks with where they are published."""
+    with mock.patch.object(sys, 'path', [str(FOLDER), *sys.path]):
+        return importlib.import_module('badges')
+
+
 class PublishedTest(parameterized.TestCase):
     """What the first cell installs, and the badges."""
 
-    def install(self, cell, folder, installed=False):
+    def install(self, notebook, folder, installed=False):
         """Runs the first cell in a folder; returns what it asks pip for."""
         asked = []
-        code = re.sub(r'%pip install --quiet (.*)', r'pip(packages)', cell)
+        code = sources(notebook, 'code')[0]
+        code = re.sub(r'%pip install --quiet (.*)', r'pip(packages)', code)
         code = re.sub(r'!apt-get.*', 'pass', code)
         found = object() if installed else None
         with (
@@ -138,51 +144,34 @@ class PublishedTest(parameterized.TestCase):
         return asked
 
     @parameterized.parameters(*NAMES)
-    def test_first_cell(self, name):
-        cell = sources(read(name), 'code')[0]
-        elsewhere = pathlib.Path('/content')
-        self.assertEqual(self.install(cell, FOLDER, installed=True), [])
-        suite, policies = self.install(cell, FOLDER)
+    def test_first_cell_and_badge(self, name):
+        notebook, elsewhere = read(name), pathlib.Path('/content')
+        self.assertEqual(self.install(notebook, FOLDER, installed=True), [])
+        suite, policies = self.install(notebook, FOLDER)
         self.assertStartsWith(suite, f'{ROOT}[video')
         self.assertEqual(policies, f'{ROOT}/trained')
-        (release,) = self.install(cell, elsewhere)
-        self.assertStartsWith(release, 'trl_suite[video')
-        self.assertEndsWith(release, 'policies]')
-        known = setup_extras()
-        self.assertLessEqual(set(release[len('trl_suite[') : -1].split(',')), known)
-
-    @parameterized.parameters(*NAMES)
-    def test_badges(self, name):
-        sys.path.insert(0, str(FOLDER))
-        self.addCleanup(sys.path.remove, str(FOLDER))
-        import badges
+        (release,) = self.install(notebook, elsewhere)
+        self.assertRegex(release, r'^trl_suite\[video.*policies\]$')
+        self.assertLessEqual(set(release[len('trl_suite[') : -1].split(',')), setup_extras())
 
         before = (FOLDER / f'{name}.ipynb').read_text(encoding='utf-8')
-        marked = badges.mark(before, 'someone/terrain', name, released=False)
+        marked = badges().mark(before, 'someone/terrain', name, released=False)
         notebook = json.loads(marked)
-        self.assertIn(
-            f'(https://colab.research.google.com/github/someone/terrain/blob/main/colab/{name}.ipynb)',
-            sources(notebook, 'markdown')[0],
-        )
-        cell = sources(notebook, 'code')[0]
-        suite, policies = self.install(cell, pathlib.Path('/content'))
-        self.assertEndsWith(suite, ' @ git+https://github.com/someone/terrain')
-        self.assertEqual(
-            policies,
-            'trl_suite_policies @ git+https://github.com/someone/terrain#subdirectory=trained',
-        )
-        released = badges.mark(marked, 'someone/terrain', name, released=True)
-        self.assertLen(self.install(sources(json.loads(released), 'code')[0], ROOT / 'x' / 'y'), 1)
-        self.assertEqual(badges.mark(released, 'someone/terrain', name, released=False), marked)
+        address = 'https://colab.research.google.com/github/someone/terrain/blob/main/colab/'
+        self.assertIn(f'({address}{name}.ipynb)', sources(notebook, 'markdown')[0])
+        suite, policies = self.install(notebook, elsewhere)
+        source = ' @ git+https://github.com/someone/terrain'
+        self.assertEndsWith(suite, source)
+        self.assertEqual(policies, f'trl_suite_policies{source}#subdirectory=trained')
+        released = badges().mark(marked, 'someone/terrain', name, released=True)
+        self.assertLen(self.install(json.loads(released), ROOT / 'x' / 'y'), 1)
+        again = badges().mark(released, 'someone/terrain', name, released=False)
+        self.assertEqual(again, marked)
 
     def test_links(self):
-        sys.path.insert(0, str(FOLDER))
-        self.addCleanup(sys.path.remove, str(FOLDER))
-        import badges
-
-        linked = badges.link((FOLDER / 'README.md').read_text(encoding='utf-8'), 'some/one')
+        linked = badges().link((FOLDER / 'README.md').read_text(encoding='utf-8'), 'some/one')
         self.assertEqual(linked.count('[Colab](https://colab'), len(NAMES))
-        self.assertEqual(badges.link(linked, 'some/one'), linked)
+        self.assertEqual(badges().link(linked, 'some/one'), linked)
 
 
 def setup_extras():
@@ -206,7 +195,3 @@ class RunTest(parameterized.TestCase):
         notebook = execute.tidy(execute.execute(FOLDER / f'{name}.ipynb', short=True))
         counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == 'code']
         self.assertEqual(counts, list(range(1, len(counts) + 1)))
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -6,30 +6,41 @@ import sys
 import time
 from unittest import mock
 
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 
 from trl_suite import suite
 from trl_suite.util import program
 
 
 class SignalTest(parameterized.TestCase):
-    @parameterized.parameters(
-        (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, program.Terminated)
-    )
-    def test_a_signal_in_a_destructor_ends_the_program(self, number, exception):
-        """Python ignores exceptions in destructors; those after the signal are not reported, either.
+    @parameterized.product(
+        signal_and_error=(
+            (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, program.Terminated),
+        ),
+        place=('destructor', 'conversion of ctypes'),
+    )  # fmt: skip
+    def test_a_signal_where_exceptions_are_lost_ends_the_program(self, signal_and_error, place):
+        """Python ignores exceptions in destructors; ctypes replaces those of its conversions.
 
-        An object may be half freed if the signal arrived in the destructor of another one.
+        Exceptions in destructors after the signal are not reported, either: an object may be half
+        freed if the signal arrived in the destructor of another one.
         """
+        number, error = signal_and_error
 
         class Signalling:
             def __del__(self):
+                signal.raise_signal(number)
+
+            @classmethod
+            def from_param(cls, value):
                 signal.raise_signal(number)
 
         class Failing:
             def __del__(self):
                 raise RuntimeError('half freed')
 
+        function = ctypes.PYFUNCTYPE(None, ctypes.py_object)(lambda value: None)
+        function.argtypes = [Signalling]
         before = signal.getsignal(signal.SIGTERM)
         with (
             mock.patch.object(sys, 'unraisablehook') as report,
@@ -38,30 +49,17 @@ class SignalTest(parameterized.TestCase):
         ):
             Failing()
             report.assert_called_once()
-            Signalling()
-            Failing()
-            time.sleep(10)
+            if place == 'destructor':
+                Signalling()
+                Failing()
+                time.sleep(10)
+            else:
+                function(1)
         report.assert_called_once()
-        self.assertIs(type(caught.exception), exception)
+        self.assertIs(type(caught.exception), error)
         self.assertIs(signal.getsignal(signal.SIGTERM), before)
-
-    @parameterized.parameters(
-        (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, program.Terminated)
-    )
-    def test_a_signal_in_a_conversion_of_ctypes_ends_the_program(self, number, exception):
-        """ctypes raises an ArgumentError in place of any exception of a conversion."""
-
-        class Argument:
-            @classmethod
-            def from_param(cls, value):
-                signal.raise_signal(number)
-
-        function = ctypes.PYFUNCTYPE(None, ctypes.py_object)(lambda value: None)
-        function.argtypes = [Argument]
-        with self.assertRaises(KeyboardInterrupt) as caught, program.terminable():
-            function(1)
-        self.assertIs(type(caught.exception), exception)
-        self.assertIsInstance(caught.exception.__cause__, ctypes.ArgumentError)
+        if place != 'destructor':
+            self.assertIsInstance(caught.exception.__cause__, ctypes.ArgumentError)
 
     def test_closing_an_environment_is_not_interrupted(self):
         """A rendering context that is half freed would be freed again, which prints a traceback."""
@@ -88,7 +86,3 @@ class MessageTest(parameterized.TestCase):
     )  # fmt: skip
     def test_a_message_is_one_short_line_without_controls(self, message, line):
         self.assertEqual(program.in_one_line(ValueError(message)), line)
-
-
-if __name__ == '__main__':
-    absltest.main()

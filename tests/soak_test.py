@@ -1,7 +1,5 @@
 """The soak: its actions, what it counts, and that runs accumulate in one file."""
 
-import contextlib
-import io
 import itertools
 import json
 import pathlib
@@ -9,8 +7,8 @@ import sys
 from unittest import mock
 
 import numpy as np
-from absl.testing import absltest
 from helpers import FolderTest
+from programs import output
 
 from trl_suite import suite
 from trl_suite.registry.task_types import TASK_TYPES
@@ -72,22 +70,15 @@ class SoakTest(FolderTest):
         self.assertGreater(found['control_steps'], 100)
 
     def run_soak(self, *arguments, **figures):
-        seen = []
+        seen, path = [], self.folder / 'a.json'
 
         def run(spec, seconds, num_envs, threads, seed):
             seen.append((spec.id, seed))
             return {**FIGURES, **figures}
 
-        argv = ['soak.py', '--seconds', '0', '--file', str(self.folder / 'a.json'), *arguments]
-        out = io.StringIO()
-        with (
-            mock.patch.object(soak, 'soak', run),
-            mock.patch.object(sys, 'argv', argv),
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(io.StringIO()),
-        ):
-            soak.main()
-        return seen, json.loads((self.folder / 'a.json').read_text()), out.getvalue()
+        with mock.patch.object(soak, 'soak', run):
+            out = output(soak.main, '--seconds', 0, '--file', path, *arguments)
+        return seen, json.loads(path.read_text()), out
 
     def test_runs_accumulate(self):
         first, _, _ = self.run_soak()
@@ -107,7 +98,3 @@ class SoakTest(FolderTest):
         self.assertEqual(self.run_soak('--seed', '1')[0], second)
         seen, _, out = self.run_soak('--show')
         self.assertEqual((seen, out.count('seed 1: 1 environments')), ([], 1))
-
-
-if __name__ == '__main__':
-    absltest.main()
