@@ -1,8 +1,6 @@
 """The viewer in the web browser and replays: what they draw, and what a real browser shows of it."""
 
 import base64
-import contextlib
-import io
 import shutil
 import socket
 import time
@@ -17,6 +15,7 @@ import pytest
 import rich.console
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
+from programs import run
 
 from trl_suite import cli, rendering, suite
 from trl_suite.arenas import PlanarArena
@@ -74,17 +73,15 @@ class SessionTest(parameterized.TestCase):
             self.assertBetween(passed, 0, FRAME + 1e-9)
             if shown.is_between_steps:
                 total += expected.step(act(None)).reward
-                np.testing.assert_array_equal(
-                    environment.physics.data.qpos, expected.physics.data.qpos
-                )
+                qpos, own = (each.physics.data.qpos for each in (environment, expected))
+                np.testing.assert_array_equal(qpos, own)
                 self.assertEqual(shown.total, total)
         self.assertAlmostEqual(environment.physics.data.time, time_passed)
         self.assertGreater(time_passed, 0.2)
         moment = shown.history[-1]
         self.assertLen(moment.rewards, len(shown.reward_names))
-        np.testing.assert_allclose(
-            moment.rewards[1:].sum(), moment.rewards[0] * (len(moment.rewards) > 1)
-        )
+        sum_ = moment.rewards[0] * (len(moment.rewards) > 1)
+        np.testing.assert_allclose(moment.rewards[1:].sum(), sum_)
         self.assertLen(moment.torques, len(shown.joint_axes))
         self.assertEqual(shown.status()['episode'], '1')
 
@@ -93,9 +90,8 @@ class SessionTest(parameterized.TestCase):
         shown = session.Session(environment, zero(environment), seed=3)
         expected = suite.make(DOG, {'random': 3})
         for _ in range(2):
-            np.testing.assert_array_equal(
-                shown.time_step.observation['terrain'], expected.reset().observation['terrain']
-            )
+            found, own = shown.time_step.observation, expected.reset().observation
+            np.testing.assert_array_equal(found['terrain'], own['terrain'])
             expected.random_state.seed(3)
             shown.reset(3)
         self.assertEqual(shown.episode, 1)
@@ -128,12 +124,16 @@ class SessionTest(parameterized.TestCase):
             shown.push('forwards', 1.0)
 
 
+def started(id_):
+    environment = suite.make(id_, {'random': 4})
+    environment.reset()
+    return environment
+
+
 class SceneTest(parameterized.TestCase):
     @parameterized.parameters(DOG, 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Steps_Terrain-v0')
     def test_planar_ground_is_that_of_the_arena(self, id_):
-        environment = suite.make(id_, {'random': 4})
-        environment.reset()
-        arena = environment.task.arena
+        arena = started(id_).task.arena
         mesh = web_meshes.planar_mesh(arena.ground)
         # Upper corners of the pieces that the mesh consists of, from its upper triangles.
         tops = mesh.triangles[mesh.face_normals[:, 2] > 0.1]
@@ -148,8 +148,7 @@ class SceneTest(parameterized.TestCase):
         np.testing.assert_allclose(heights[long], found[long], atol=1e-6)
 
     def test_height_field_is_that_of_the_arena(self):
-        environment = suite.make(HILLS, {'random': 4})
-        environment.reset()
+        environment = started(HILLS)
         model, data = environment.physics.model.ptr, environment.physics.data.ptr
         field = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[0])
         mesh = web_meshes.height_field_mesh(model, data, field)
@@ -185,9 +184,7 @@ class SceneTest(parameterized.TestCase):
 
     def shown(self, id_):
         """An environment in its first state, and its scene in a server."""
-        environment = suite.make(id_, {'random': 4})
-        environment.reset()
-        server = web_server.start_server('127.0.0.1', 0)
+        environment, server = started(id_), web_server.start_server('127.0.0.1', 0)
         self.addCleanup(web_server.stop_server, server)
         return environment, web_scene.WebScene(server, environment)
 
@@ -205,8 +202,7 @@ class SceneTest(parameterized.TestCase):
 
     @parameterized.parameters(DOG, HILLS, SOCCER, FOREST, RAMP)
     def test_squares_cover_the_ground(self, id_):
-        environment = suite.make(id_, {'random': 4})
-        environment.reset()
+        environment = started(id_)
         arena = environment.task.arena
         if isinstance(arena, PlanarArena):
             meshes = {(0, 'boxes'): web_meshes.planar_mesh(arena.ground)}
@@ -289,15 +285,8 @@ class SceneTest(parameterized.TestCase):
 class OptionTest(absltest.TestCase):
     def test_options_of_the_task(self):
         """The command passes them on, and every environment that the viewer shows has them."""
-        words = (
-            'view',
-            DOG,
-            '--browser',
-            '--port',
-            '8765',
-            '--option',
-            'randomize={"friction": 0.3}',
-        )
+        option = 'randomize={"friction": 0.3}'
+        words = 'view', DOG, '--browser', '--port', '8765', '--option', option
         with mock.patch.object(browser, 'Browser') as made:
             self.assertEqual(cli.main(words), 0)
         self.assertEqual(made.call_args.args[-1], {'randomize': {'friction': 0.3}})
@@ -368,9 +357,8 @@ class ReplayTest(FolderTest):
     )  # fmt: skip
     def test_ten_seconds_take_no_more_than_3_mb(self, id_, largest):
         """On hills with falls every second, each of which lays another height field."""
-        environment, random = suite.make(id_, {'random': 1}), np.random.default_rng(0)
+        environment, random = started(id_), np.random.default_rng(0)
         path, states = self.folder / 'replay.html', []
-        environment.reset()
         with replays.Replay(environment, path) as recording:
 
             def add():
@@ -387,11 +375,11 @@ class ReplayTest(FolderTest):
         self.assertEqual(path.read_text(encoding='utf-8'), recording.html)
 
     def test_by_the_command(self):
-        with contextlib.redirect_stdout(io.StringIO()) as printed:
-            words = 'rollout', DOG, '--steps', '5', '--html', str(self.folder / 'dog.html')
-            self.assertEqual(cli.main(words), 0)
-        self.assertIn('dog.html', printed.getvalue())
-        self.assertNotIn('viser', printed.getvalue())
+        path = str(self.folder / 'dog.html')
+        status, out, _ = run('rollout', DOG, '--steps', '5', '--html', path)
+        self.assertEqual(status, 0)
+        self.assertIn('dog.html', out)
+        self.assertNotIn('viser', out)
 
     def test_in_a_notebook(self):
         """The replay is all that is shown: rich, with which viser prints, writes into outputs."""
@@ -409,9 +397,7 @@ class ReplayTest(FolderTest):
         ('the replay has no states', 'goat.html', {}),
     )
     def test_invalid_arguments_of_a_replay_are_rejected(self, message, name, options):
-        environment = suite.make(GOAT, {'random': 1})
-        environment.reset()
-        path = name and self.folder / name
+        environment, path = started(GOAT), name and self.folder / name
         with (
             self.assertRaisesRegex(ValueError, message),
             replays.Replay(environment, path, **options),
@@ -504,15 +490,10 @@ class ChromiumTest(FolderTest):
         self.wait_until_it_moves(page)
         page.get_by_role('button', name='Pause').click()
         self.wait_for(lambda: not viewer.playing, 'it goes on')
-        before = viewer.session.environment.physics.data.time
+        data = viewer.session.environment.physics.data
+        before = data.time
         page.get_by_role('button', name='One frame').click()
-        self.wait_for(
-            lambda: viewer.session.environment.physics.data.time > before, 'there is no frame'
-        )
+        self.wait_for(lambda: data.time > before, 'there is no frame')
         page.get_by_role('button', name='Play').click()
         self.wait_for(lambda: viewer.playing, 'it does not go on')
         self.assert_quiet(viewer.url)
-
-
-if __name__ == '__main__':
-    absltest.main()

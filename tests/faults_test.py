@@ -15,7 +15,6 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from unittest import mock
@@ -23,7 +22,8 @@ from unittest import mock
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
+from helpers import FolderTest
 
 from trl_suite import cli, motion, policies, sequences, suite, terrain
 from trl_suite.util import files, program
@@ -215,16 +215,13 @@ def content(path):
     return path.read_bytes()
 
 
-class FaultsTest(parameterized.TestCase):
+class FaultsTest(FolderTest):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        cls.server = cls.enterClassContext(
-            subprocess.Popen(
-                [sys.executable, __file__, 'serve'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                text=True,
-            )
-        )  # fmt: skip
+        command = [sys.executable, __file__]
+        pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
+        cls.server = cls.enterClassContext(subprocess.Popen(command, **pipes))
 
     @classmethod
     def tearDownClass(cls):
@@ -233,8 +230,8 @@ class FaultsTest(parameterized.TestCase):
 
     def setUp(self):
         super().setUp()
-        self.place = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.folder = self.new('folder')
+        self.place, self.folder = self.folder, self.folder / 'folder'
+        self.folder.mkdir()
 
     def new(self, name):
         folder = self.place / name
@@ -276,10 +273,9 @@ class FaultsTest(parameterized.TestCase):
         draw = random.Random(seed)
         for number in signals:
             after = draw.uniform(0, 1.1 * seconds)
-            status, text, _ = self.run_program(
-                self.folder, name, *arguments, number=number, after=after
-            )
-            with self.subTest(name=name, signal=number, after=after, seed=seed):
+            how = {'number': number, 'after': after}
+            status, text, _ = self.run_program(self.folder, name, *arguments, **how)
+            with self.subTest(name=name, seed=seed, **how):
                 ends = {
                     signal.SIGKILL: (0, -9),
                     signal.SIGINT: (0, 130),
@@ -385,7 +381,4 @@ class FaultsTest(parameterized.TestCase):
 
 
 if __name__ == '__main__':
-    if sys.argv[1:] == ['serve']:
-        serve()
-    else:
-        absltest.main()
+    serve()

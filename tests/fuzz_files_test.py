@@ -26,7 +26,7 @@ import own_clip_test
 import own_test
 import policies_test
 import pytest
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import mjcf
 from hypothesis import strategies as st
 
@@ -115,27 +115,20 @@ def likely(good, others):
 def picture(draw, suffixes=('png', 'tif', 'tiff', 'bmp', 'jpg', 'jpeg')):
     """A suffix, and a picture of any format, which may be another one."""
     size = likely(3, SIZES)
-    width, height, depth, kind = (
-        draw(size),
-        draw(size),
-        draw(likely(8, SIZES)),
-        draw(likely(0, SIZES)),
-    )
+    width, height = draw(size), draw(size)
+    depth, kind = draw(likely(8, SIZES)), draw(likely(0, SIZES))
     data = draw(st.one_of(st.just(bytes(40)), st.binary(max_size=60)))
 
     def chunk(name, content):
-        return struct.pack('>I', len(content)) + name + content + struct.pack(
-            '>I', zlib.crc32(name + content)
-        )  # fmt: skip
+        check = struct.pack('>I', zlib.crc32(name + content))
+        return struct.pack('>I', len(content)) + name + content + check
 
     def entry(tag, value):
-        return struct.pack(
-            '<HHII', tag, draw(likely(4, (1, 2, 3, 12))), draw(likely(1, SIZES)), value
-        )
+        kind, count = draw(likely(4, (1, 2, 3, 12))), draw(likely(1, SIZES))
+        return struct.pack('<HHII', tag, kind, count, value)
 
-    png = b'\x89PNG\r\n\x1a\n' + chunk(
-        b'IHDR', struct.pack('>IIBBBBB', width, height, depth % 256, kind % 256, 0, 0, 0)
-    )
+    head = struct.pack('>IIBBBBB', width, height, depth % 256, kind % 256, 0, 0, 0)
+    png = b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', head)
     png += chunk(b'IDAT', zlib.compress(data)) + chunk(b'IEND', b'')
     bmp = b'BM' + struct.pack('<IIIIiiHHIIIIII', 54, 0, 54, 40, width % 2**31, height % 2**31, 1,
                               depth % 2**16, kind, len(data), 0, 0, 0, 0) + data  # fmt: skip
@@ -149,9 +142,8 @@ def picture(draw, suffixes=('png', 'tif', 'tiff', 'bmp', 'jpg', 'jpeg')):
         rb'(\xff\xc0..\x08)....', lambda found: found[1] + struct.pack('>HH', height % 2**16, width % 2**16),
         jpeg.getvalue(), flags=re.DOTALL,
     )  # fmt: skip
-    other = draw(
-        st.sampled_from((POSTSCRIPT, b'GIF89a', b'P6 9 9 255 ', b'RIFF', b'\x00\x00\x01\x00', b''))
-    )
+    begins = POSTSCRIPT, b'GIF89a', b'P6 9 9 255 ', b'RIFF', b'\x00\x00\x01\x00', b''
+    other = draw(st.sampled_from(begins))
     formats = {'png': png, 'bmp': bmp, 'tif': tiff, 'tiff': tiff, 'jpg': jpeg, 'jpeg': jpeg}
     suffix = draw(st.sampled_from(suffixes))
     return suffix, draw(likely(formats[suffix], (*formats.values(), other + data)))
@@ -201,7 +193,7 @@ def solid(draw):
     obj = [
         f'mtllib {draw(word)}',
         'usemtl a',
-        *(f'v {point}' for point in points),
+        *(f'v {each}' for each in points),
         'vt 0 0',
         f'f {face}',
     ]
@@ -216,21 +208,13 @@ def solid(draw):
     if draw(st.booleans()):
         stl = bytes(80) + struct.pack('<I', count) + draw(likely(bytes(50), (data,)))
     else:
-        stl = '\n'.join(
-            ['solid', *(f'vertex {point}' for point in points), 'endsolid', '']
-        ).encode()
+        vertices = [f'vertex {point}' for point in points]
+        stl = '\n'.join(['solid', *vertices, 'endsolid', '']).encode()
     tree = draw(scene())
-    glb = b'glTF' + struct.pack(
-        '<IIII', 2, 20 + len(tree), draw(likely(len(tree), SIZES)), 0x4E4F534A
-    )
+    size = draw(likely(len(tree), SIZES))
+    glb = b'glTF' + struct.pack('<IIII', 2, 20 + len(tree), size, 0x4E4F534A) + tree
     lines = draw(st.one_of(st.just(obj), st.permutations(obj)))
-    contents = {
-        'obj': '\n'.join(lines).encode(),
-        'ply': ply,
-        'stl': stl,
-        'gltf': tree,
-        'glb': glb + tree,
-    }
+    contents = {'obj': '\n'.join(lines).encode(), 'ply': ply, 'stl': stl, 'gltf': tree, 'glb': glb}
     suffix = draw(st.sampled_from(sorted(contents)))
     return suffix, draw(likely(contents[suffix], (*contents.values(), POSTSCRIPT)))
 
@@ -301,10 +285,8 @@ def surface(path):
 
 def result():
     """The result of a sequence of two environments."""
-    scores, ids = (
-        [[0.5, 0.25], [0.25, 0.75]],
-        ['PD_Dog2D_Flat_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'],
-    )
+    scores = [[0.5, 0.25], [0.25, 0.75]]
+    ids = ['PD_Dog2D_Flat_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0']
     found = {
         'format': sequences.BENCHMARK.format, 'trl_suite': '0', 'learner': 'a:B', 'sequence': 'mine',
         'ids': ids, 'budget': 9, 'episodes': 2, 'seed': 0, 'initial': [0.1, 0.2], 'scores': scores,
@@ -331,11 +313,8 @@ def files(folder):
     frame = [0.1, 0, 0.9, 0, 1, 0, 0, 0]
     for size in motion.HUMANOID3D.values():
         frame += [0] if size == 1 else [1, 0, 0, 0]
-    deepmimic = {
-        'Loop': 'wrap',
-        'CycleSyncRootRot': True,
-        'Frames': [frame, [*frame[:1], 0.5, *frame[2:]]],
-    }
+    frames = [frame, [*frame[:1], 0.5, *frame[2:]]]
+    deepmimic = {'Loop': 'wrap', 'CycleSyncRootRot': True, 'Frames': frames}
     presets = pathlib.Path(terrain.__file__).parent
     grid = np.add.outer(np.linspace(-0.2, 0.3, 9), np.linspace(0, 0.2, 8))
     hill = terrain.SpatialGround(terrain.from_heights(grid, 0.5, 'hill'), 0)
@@ -462,7 +441,3 @@ class FuzzTest(parameterized.TestCase):
                 self.assertIn(f'hill{suffix}: cannot be read as', str(error))
         mine = [name for event, name in events if event != 'open' or str(folder) in name]
         self.assertLen(mine, 1)  # the file itself
-
-
-if __name__ == '__main__':
-    absltest.main()

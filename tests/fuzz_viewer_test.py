@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from viser import _messages
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -269,13 +269,11 @@ class ValuesTest(ViewerTest):
         client.set('Policy', 'random')
         client.set('Pause', True)
         viewer, expected = self.viewer, (2**32 - 1, 0.5, 'random', False)
-        self.assertTrue(
-            waited_for(
-                lambda: (
-                    (viewer.seed, viewer.speed, viewer._loaded.policy, viewer.playing) == expected
-                )
-            )
-        )
+
+        def state():
+            return viewer.seed, viewer.speed, viewer._loaded.policy, viewer.playing
+
+        self.assertTrue(waited_for(lambda: state() == expected))
         self.assert_told()
         self.assertEqual(control(viewer, 'm/s').value, 2.0)
 
@@ -405,9 +403,8 @@ class Fuzz:
 
     def __init__(self, viewer, seed, ids):
         self.viewer, self.random, self.ids = viewer, random.Random(seed), ids
-        self.kinds = [
-            each for each in _messages.Message.get_subclasses() if each.__name__[0] != '_'
-        ]
+        kinds = _messages.Message.get_subclasses()
+        self.kinds = [each for each in kinds if each.__name__[0] != '_']
         self.clients = [Client(viewer) for _ in range(3)]
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder, 'a.npz')
@@ -555,7 +552,3 @@ class FuzzTest(ViewerTest):
         self.assertTrue(waited_for(lambda: not uploads(self.viewer)))
         for call in self.tell.call_args_list:
             self.assertNotIn(tempfile.gettempdir(), call.args[0])
-
-
-if __name__ == '__main__':
-    absltest.main()
