@@ -10,7 +10,7 @@ import tempfile
 from unittest import mock
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import FolderTest, assert_refused
 from programs import CommandTest
 
@@ -222,7 +222,7 @@ with contextlib.suppress(ImportError):
     import stable_baselines_learners
     import td3_learner
 
-    class StableBaselinesTest(parameterized.TestCase):
+    class StableBaselinesTest(FolderTest):
         @parameterized.parameters(
             stable_baselines_learners.PPO, stable_baselines_learners.SAC, td3_learner.TD3
         )
@@ -233,32 +233,29 @@ with contextlib.suppress(ImportError):
             expected, _ = learner.model.predict(observations.astype(np.float32), deterministic=True)
             np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
             self.assertGreater(np.abs(expected).max(), 1e-3)
-            path = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory())) / 'policy.npz'
+            path = self.folder / 'policy.npz'
             policies.save(policy, path)
             np.testing.assert_array_equal(policies.load(path)(observations), policy(observations))
 
         @parameterized.parameters(stable_baselines_learners.SAC, td3_learner.TD3)
         def test_a_stopped_run_resumes_exactly(self, kind):
-            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-
             def measured(cases, *_, executor):
                 for _, policy in cases:
                     score = float(np.abs(policy.weights[1]).mean())
                     yield {'normalized_return': min(score, 1.0)}
 
+            # Four parts instead of twenty, for each of which everything is written.
+            course = dataclasses.replace(benchmark.get(ID), parts=4)
+            short = dataclasses.replace(benchmark.BENCHMARK, courses={ID: course})
+
             def run(name, stages=None):
-                course = benchmark.get(ID)
-                path = folder / name
-                return benchmark.run(course, kind(course, 0), 160, path, 1, 0, 1, stages=stages)
+                path = self.folder / name
+                return short.run(course, kind(course, 0), 160, path, 1, 0, 1, stages=stages)
 
             with mock.patch.object(evaluation, 'evaluate_all', measured):
                 whole = run('whole.json')
-                run('parts.json', 17)
+                run('parts.json', 3)
                 parts = run('parts.json')
             for name in ('scores', 'samples', 'curves', 'policy'):
                 self.assertEqual(parts[name], whole[name], name)
             self.assertNotEqual(whole['scores'][-1], whole['scores'][0])
-
-
-if __name__ == '__main__':
-    absltest.main()

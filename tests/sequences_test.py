@@ -3,7 +3,6 @@
 `benchmark_test` has what only the benchmark does.
 """
 
-import concurrent.futures
 import contextlib
 import copy
 import json
@@ -253,7 +252,9 @@ class RunCase(FolderTest):
     def setUp(self):
         super().setUp()
         self.path = self.folder / 'result.json'
-        self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
+        self.tests = self.enterContext(
+            mock.patch.object(evaluation, 'evaluate_all', side_effect=made_up)
+        )
         self.enterContext(mock.patch.object(running.time, 'perf_counter', lambda: 0.0))
 
     def run_short(self, learner, which=SEQUENCES, **changes):
@@ -263,9 +264,11 @@ class RunCase(FolderTest):
 
 class RunTest(RunCase):
     def test_stages_of_a_sequence(self):
-        learner = Counter()
-        result = self.run_short(learner, seed=3)
+        learner, executor = Counter(), object()
+        result = self.run_short(learner, seed=3, episodes=2, num_threads=5, executor=executor)
         self.assertEqual(learner.history, [[id_, 7, 3] for id_ in SHORT.ids])
+        tests = [mock.call(mock.ANY, 2, sequences.test_seeds(2, 3), 5, executor=executor)] * 4
+        self.assertEqual(self.tests.call_args_list, tests)
         np.testing.assert_allclose(result['initial'], [0, 0.01, 0.02])
         np.testing.assert_allclose(
             result['scores'], np.add.outer([0.04, 0.08, 0.12], [0, 0.01, 0.02])
@@ -277,7 +280,7 @@ class RunTest(RunCase):
         self.assertEqual(sequences.read(self.path), result)
         self.assert_only('result.json')
         # A finished result needs no learning.
-        self.assertEqual(self.run_short(Counter(stop_at=0), seed=3), result)
+        self.assertEqual(self.run_short(Counter(stop_at=0), seed=3, episodes=2), result)
 
     def test_parts_of_the_benchmark(self):
         """Of 10 samples each; what is left of one is for the next."""
@@ -419,20 +422,6 @@ class RunTest(RunCase):
         assert_refused(self, (run(Counter()), 'result.json: format is missing'))
 
 
-class ExecutorTest(absltest.TestCase):
-    def test_scores_do_not_depend_on_the_executor(self):
-        def still(observation):
-            return np.zeros((len(observation), 20))
-
-        expected = [
-            evaluation.evaluate(id_, still, 4, sequences.test_seeds(4, 1))['normalized_return']
-            for id_ in SHORT.ids
-        ]
-        self.assertEqual(sequences.scores(SHORT, still, 4, 1), expected)
-        with concurrent.futures.ThreadPoolExecutor(2) as pool:
-            self.assertEqual(sequences.scores(SHORT, still, 4, 1, executor=pool), expected)
-
-
 def changed(result, name, value):
     """Returns a copy with another value of an entry, such as 'scores[1][2]', and its digest."""
     *path, last = (
@@ -568,12 +557,10 @@ class LearnerTest(CommandTest):
     def setUp(self):
         super().setUp()
         pathlib.Path('my_learner.py').write_text(MODULE)
-        self.enterContext(
-            mock.patch.object(
-                evaluation, 'evaluate_all',
-                lambda cases, *_, executor: [{'normalized_return': 0.5} for _ in cases],
-            )
-        )  # fmt: skip
+        scores = mock.Mock(
+            side_effect=lambda cases, *_, **__: [{'normalized_return': 0.5}] * len(cases)
+        )
+        self.enterContext(mock.patch.object(evaluation, 'evaluate_all', scores))
 
     @parameterized.parameters(
         ('sequences', 'plaid_biped', '100', 'result.json', sequences.BENCHMARK, 10, '100 of 100',
@@ -640,31 +627,26 @@ class BaselinesTest(FolderTest):
     def setUp(self):
         super().setUp()
         self.enterContext(contextlib.chdir(self.folder))
-        self.enterContext(mock.patch.object(continual, 'NUM_ENVS', 8))
-        settings = continual.settings.settings_for
-        small = {'hidden': (16, 16), 'minibatch': 128, 'cloning_epochs': 2}
-        self.enterContext(
-            mock.patch.object(
-                continual.settings, 'settings_for',
-                lambda id_, **k: settings(id_, **{**k, **small}),
-            )
-        )  # fmt: skip
+        made, small = continual.settings.settings_for, {'hidden': (16, 16), 'minibatch': 128}
+        small['cloning_epochs'] = 2
+
+        def settings(id_, **changes):
+            return made(id_, **{**changes, **small})
+
         # Quicker than episodes, and as telling: what the network has become.
-        self.enterContext(
-            mock.patch.object(
-                evaluation, 'evaluate_all',
-                lambda cases, *_, executor: [
-                    {'normalized_return': float(np.abs(policy.weights[1]).mean())}
-                    for _, policy in cases
-                ],
-            )
-        )  # fmt: skip
+        def scores(cases, *_, executor):
+            means = [float(np.abs(policy.weights[1]).mean()) for _, policy in cases]
+            return [{'normalized_return': mean} for mean in means]
+
+        for owner, name, value in (
+            (continual, 'NUM_ENVS', 8), (continual.settings, 'settings_for', settings),
+            (evaluation, 'evaluate_all', scores),
+        ):  # fmt: skip
+            self.enterContext(mock.patch.object(owner, name, value))
 
     def run_short(self, kind, name, **changes):
-        learner = kind(SHORT, 0)
-        return learner, sequences.run(
-            SHORT, learner, **{'budget': 600, 'path': f'{name}.json', 'episodes': 1, **changes}
-        )
+        options = {'budget': 600, 'path': f'{name}.json', 'episodes': 1, **changes}
+        return sequences.run(SHORT, kind(SHORT, 0), **options)
 
     @parameterized.parameters(
         (continual.Scratch, np.eye(3)),
@@ -676,7 +658,7 @@ class BaselinesTest(FolderTest):
     @pytest.mark.slow  # .ci/run runs these
     def test_every_stage_trains_in_its_own_environments(self, kind, expected):
         """The samples of a stage are those of its terrain, or of those that the method needs."""
-        _, result = self.run_short(kind, 'result')
+        result = self.run_short(kind, 'result')
         found = np.array(result['samples'])
         np.testing.assert_array_equal(found > 0, expected.astype(bool))
         self.assertEqual(found.sum(1).max(), found.sum(1).clip(500, 600).max())
@@ -686,7 +668,7 @@ class BaselinesTest(FolderTest):
     @parameterized.parameters(continual.FineTuning, continual.EWC, continual.Plaid)
     @pytest.mark.slow
     def test_a_stopped_run_resumes_exactly(self, kind):
-        _, whole = self.run_short(kind, 'whole')
+        whole = self.run_short(kind, 'whole')
         train = kind.train
 
         def stopped(learner, stage):
@@ -696,7 +678,7 @@ class BaselinesTest(FolderTest):
 
         with mock.patch.object(kind, 'train', stopped), self.assertRaises(KeyboardInterrupt):
             self.run_short(kind, 'parts')
-        _, parts = self.run_short(kind, 'parts')
+        parts = self.run_short(kind, 'parts')
         for name in ('initial', 'scores', 'samples', 'curves', 'metrics'):
             self.assertEqual(parts[name], whole[name], name)
 
@@ -745,7 +727,3 @@ class BaselinesTest(FolderTest):
         np.testing.assert_array_equal(each[:, 0], 0.5)
         np.testing.assert_array_equal(each[:, 1], -1.0)
         self.assertEqual(stage.samples.tolist(), [300, 300, 0])
-
-
-if __name__ == '__main__':
-    absltest.main()
