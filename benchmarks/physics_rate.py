@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 
 from trl_suite import suite
-from trl_suite.tasks.task import SUBSTEPS as DEFAULT
+from trl_suite.tasks.common.control import SUBSTEPS as DEFAULT
 
 RATES = (100, 40, 20, 10, 8, 5, 4)  # physics steps per control step of 1/30 s, finest first
 CONTROL_RATE = 30  # Hz

@@ -115,10 +115,13 @@ class Travel(NamedTuple):
 
 @compiled
 def go(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
-    """Writes the distance of the root from the start, along +x or in any horizontal direction."""
+    """Writes the distance of the root from the start, along the first heading or in any direction."""
     x = measurement.root[i, 0] - travel.origin[i, 0]
     y = measurement.root[i, 1] - travel.origin[i, 1]
-    travel.distance[i] = x if along else np.sqrt(x * x + y * y)
+    if along:
+        travel.distance[i] = math.cos(travel.origin[i, 2]) * x + math.sin(travel.origin[i, 2]) * y
+    else:
+        travel.distance[i] = math.sqrt(x * x + y * y)
 
 
 @compiled

@@ -24,18 +24,6 @@ from trl_suite.tasks.rewards import Outcome, Term, outcome
 if TYPE_CHECKING:
     from trl_suite.tasks.variation.levels import Levels
 
-MOST_SUBSTEPS = 1000  # physics steps per control step
-MOST_SAMPLES = 10_000  # heights observed on a line
-# Meanings of options that several tasks have.
-START_PHASE = (
-    'phase at the start of an episode, in [0, 1), or pairs of bounds between which it is drawn; by '
-    'default drawn from [0, 1)'
-)
-TERRAIN_LEVEL = "index of the terrain's parameter set; fractions interpolate: 0.5 is half-way between sets 0 and 1"
-SPAWNS = ('intended', 'upstream')
-SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
-ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
-
 
 class Marker(NamedTuple):
     """A shape that a task adds to rendered images. It has no effect on the physics.

@@ -1,18 +1,21 @@
-"""Base classes of tasks for a body with a reference motion: clock, actions, observation, start."""
+"""Base classes of tasks for a body whose joints are controlled 30 times per second.
+
+A `BodyTask` has a body on random ground, and a clock with the period of a motion; a `TrackingTask` compares
+the body with this motion.
+"""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite import actuation
-from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.arenas import PlanarArena, SpatialArena
-from trl_suite.bodies.blocks import Block, action_reflection, columns, layout, reflected
-from trl_suite.bodies.body import Body, Measurement, Travel, go
+from trl_suite.bodies.blocks import Block, action_reflection, by_name, columns, layout, reflected
+from trl_suite.bodies.body import Measurement, Travel, go
 from trl_suite.bodies.planar import PlanarBody
 from trl_suite.bodies.reference import (
     CONTROL_TIMESTEP,
@@ -30,116 +33,97 @@ from trl_suite.engine import World
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.common.control import (
-    PlanarConfig,
-    SpatialConfig,
     check_motion,
-    check_position_options,
-    position_range,
+    cycle_poses,
+    joint_options,
     start_phases,
 )
-from trl_suite.tasks.rewards import Comparison, Outcome, comparison
+from trl_suite.tasks.common.footstep_plan import pose_of_step, straight_step, typical_poses
+from trl_suite.tasks.rewards import Comparison, Outcome, comparison, conclude
 from trl_suite.tasks.task import Task, drawn_seed
 from trl_suite.terrain import PlanarGround, SpatialGround
-from trl_suite.util.compiled import compiled, compiled_inline, packed
+from trl_suite.util.compiled import Compiled, compiled, compiled_inline, packed
 
 VIEW_BEHIND, VIEW_AHEAD = 0.5, 3.0  # m; range of observed ground heights in the plane
 
 
-def make_body(
-    character: Character,
-    arena: PlanarArena | SpatialArena,
-    terrain_observation: Any,
-    contact: bool = False,
-    muscles: tuple[Muscle, ...] = (),
-) -> Body:
-    """Attaches a character to an arena, planar or spatial as the character.
-
-    Args:
-      character: without actuators.
-      arena: the arena with its terrain.
-      terrain_observation: number of ground heights in the plane; names of maps in three dimensions.
-      contact: whether contacts of end effectors are measured in the plane, too.
-      muscles: the muscles whose strain is observed, in the plane.
-    """
-    if isinstance(arena, SpatialArena):
-        return SpatialBody(character, arena, 'height' in terrain_observation)
-    ground = VIEW_BEHIND, VIEW_AHEAD, terrain_observation
-    return PlanarBody(character, arena, *ground, contact, muscles)
-
-
-class ClockedTask(Task):
-    """A body with a clock that has the period of its reference motion.
-
-    A subclass defines observation, reward and the start of an episode.
+class BodyTask(Task):
+    """A body on random ground whose joints are controlled; a subclass defines what it is to do.
 
     Attributes:
       figure: the body in every simulation.
-      clock: phase of each simulation in its cycle.
-      period: duration of a cycle, s.
       joint_map: the map from actions of the joints to actuators.
+      travel: start of each episode, and the distance from it.
+      motion: the motion that the character is to perform, if there is one; also `clip`, or `steps`.
+      clock: phase of each simulation in a cycle of this motion.
+      period: duration of a cycle, of two steps, s.
+      finish_all, observe_all: compiled functions of indices and pack: they finish steps, and write
+        the observations of current states, after the bodies were measured.
     """
 
     ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
-    config: Any  # options of the subclass
+    length = 0.0  # m; of the step of a library with which episodes start
+    strain = True  # whether the strain of muscles is observed
     figure: Any  # PlanarBody or SpatialBody
+    motion: Any  # Clip or FootstepLibrary
+    finish_all: Compiled
+    observe_all: Compiled
+    _first: int  # index of the step with which episodes start
 
     def __init__(
         self,
         character: Character,
         arena: PlanarArena | SpatialArena,
-        motion: Clip | FootstepLibrary,
-        typical_poses: np.ndarray,
+        motion: Clip | FootstepLibrary | None,
         config: Any,
+        actuation_model: str,
         *,
-        period: float,
-        actuation_model: str = 'position',
         terrain_observation: Any = (),
         contact: bool = False,
     ) -> None:
         """Attaches the character and its actuators to the arena.
 
         Args:
-          character: a character without actuators; it is attached to the arena.
-          arena: the arena with its terrain, planar or spatial as the character.
-          motion: the reference motion.
-          typical_poses: poses whose mean is action 0 of position control, (k, columns of a pose).
-          config: the options.
-          period: duration of a cycle, s.
-          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_observation, contact: see `make_body`.
+          character, arena, motion, config, actuation_model: see `TrackingTask`.
+          terrain_observation: number of ground heights in the plane; names of maps in 3D.
+          contact: whether contacts of end effectors are measured in the plane, too.
 
         Raises:
           ValueError: incompatible options, or a motion that does not fit the character.
         """
-        check_motion(character, motion)
-        offset = getattr(config, 'action_offset', 'clip'), getattr(config, 'action_scale', None)
-        check_position_options(actuation_model, *offset)
-        self.character, self.arena, self.motion = character, arena, motion
-        self.actuation_model, self.config, self.period = actuation_model, config, period
-        muscle_set = getattr(config, 'muscle_set', PLAIN)
-        options: dict[str, Any] = {}
-        muscles: tuple[Muscle, ...] = ()
-        if actuation_model == 'position':
-            options = position_range(character, motion, typical_poses, *offset)
-        elif actuation_model == 'muscle':
-            options = {'muscle_set': muscle_set}
-            muscles = actuation.character_muscles(character, muscle_set)
-        if muscle_set != PLAIN and not muscles:
-            raise ValueError(
-                f'muscle_set is an option of muscle control, not {actuation_model} control'
+        self.character, self.arena, self.config = character, arena, config
+        self.actuation_model, self.motion = actuation_model, motion
+        self._spatial, self.period = character.spec.spatial, 0.0
+        typical = None  # poses whose mean is action 0 of position control
+        if motion is not None:
+            check_motion(character, motion)
+        if isinstance(motion, Clip):
+            self.clip, self.period, typical = motion, motion.duration, cycle_poses(motion)
+        elif motion is not None:
+            self.steps, self.period = motion, 2 * motion.duration
+            self._first = straight_step(motion, self.length)
+            typical = typical_poses(motion, self._first)
+        options, muscles = joint_options(character, config, actuation_model, motion, typical)
+        if isinstance(arena, SpatialArena):
+            self.figure = SpatialBody(character, arena, 'height' in terrain_observation)
+        else:
+            sight = VIEW_BEHIND, VIEW_AHEAD, terrain_observation
+            self.figure = PlanarBody(
+                character, arena, *sight, contact, muscles if self.strain else ()
             )
-        self.figure = make_body(character, arena, terrain_observation, contact, muscles)
         self.fields = self.figure.fields
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         self.joint_map = actuation.add(character, actuation_model, self.physics_timestep, **options)
 
-    # Methods of a subclass.
+    @abc.abstractmethod
+    def _bind(self, world: World) -> Any:
+        """Allocates arrays; returns the data of `finish_all` and `observe_all`."""
 
     @abc.abstractmethod
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draws ground and initial state; writes `clock.start` and `travel.origin`.
+        """Draws ground and initial state, with `_begin_ground`.
 
         Returns:
           The arguments of `figure.place`: poses, rates, and extents in the plane, or spawns.
@@ -154,13 +138,13 @@ class ClockedTask(Task):
     def root_entity(self) -> PlanarArena | SpatialArena:
         return self.arena
 
-    def _bind_clock(self, world: World) -> None:
-        """Allocates clock and outcome; a subclass may extend `saved` and `info_arrays` afterwards."""
+    def bind(self, world: World) -> None:
         self.world, n = world, world.n
         self.clock, self.travel = allocated(Clock, n), allocated(Travel, n)
         self._random = [np.random.default_rng(0)] * n  # for draws within an episode
         self._allocate(n, self.travel.distance)
         self.saved = (self.clock, self.travel, self.outcome)
+        self._pack = packed(self._bind(world))
 
     @property
     def phase(self) -> np.ndarray:
@@ -172,11 +156,10 @@ class ClockedTask(Task):
         """Time in periods of the motion: the phase, not wrapped, (n,)."""
         return self.clock.cycles
 
-    # Episodes.
+    # Episodes and steps.
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         self.world.reset(env_ids)
-        self.clock.steps[env_ids] = 0
         self.figure.place(env_ids, *self._start(env_ids, random_states))
         for array in self.outcome[1:]:  # all but the observation
             array[env_ids] = 0
@@ -188,6 +171,40 @@ class ClockedTask(Task):
         """Sets the clocks of some simulations to `clock.start`."""
         cycles = np.rint(self.clock.start[env_ids] * DIGITS) / DIGITS
         self.clock.cycles[env_ids], self.clock.phase[env_ids] = cycles, cycles - np.floor(cycles)
+        self.clock.steps[env_ids] = 0
+
+    def _begin_ground(self, i: int, seed: np.random.SeedSequence, random: Any = None) -> None:
+        """Begins an episode on random ground: in 3D at a random place, if there is `random`."""
+        ground = self._ground(i, seed)
+        if isinstance(ground, PlanarGround):
+            self.arena.begin_episode(i, ground)
+            return
+        if random is not None:
+            self.travel.origin[i] = ground.spawn(random)
+        self.arena.begin_episode(i, ground, self.travel.origin[i, :2])
+
+    def _ground(self, i: int, seed: np.random.SeedSequence) -> PlanarGround | SpatialGround:
+        """Returns the ground of an episode."""
+        terrain, level = self.arena.terrain, self.config.terrain_level
+        if self._spatial:
+            return SpatialGround(terrain, seed, terrain_level=level)
+        return PlanarGround(terrain, seed, terrain_level=level, **self._flat(i))
+
+    def _flat(self, i: int) -> dict[str, Any]:
+        """Returns where the ground is flat at the start, in the plane; see `PlanarGround`."""
+        return {}
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        self.figure.control(env_ids, action)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        self.figure.measure(env_ids, stepped=True)
+        self.finish_all(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        self.figure.measure(env_ids)
+        self.observe_all(env_ids, self._pack)
 
     def get_state(self, env_id: int) -> dict[str, Any]:
         random = self._random[env_id].bit_generator.state
@@ -199,10 +216,10 @@ class ClockedTask(Task):
         self._random[env_id].bit_generator.state = state['random']
 
 
-class TrackingTask(ClockedTask):
-    """A body whose joints are controlled 30 times per second, as in a reference motion.
+class TrackingTask(BodyTask):
+    """A body tracks a reference motion.
 
-    A subclass defines further observation blocks, which follow those of the body and the phase.
+    A subclass defines the observation blocks that follow those of the body and the phase.
 
     Attributes:
       full: the blocks of the full observation, from which the observation is derived.
@@ -210,8 +227,10 @@ class TrackingTask(ClockedTask):
     """
 
     draws = True  # whether random numbers are drawn within an episode
-    along = False  # whether the distance travelled is along +x
+    along = False  # whether the distance travelled is along the heading at the start
     mirrored = False  # whether observations and actions are mirrored in left stance
+    tracks = 1  # parts of a clip, each of which is a track of the reference
+    hidden: tuple[str, ...] = ()  # names of blocks that are not observed
     reference: Reference
 
     def __init__(
@@ -219,48 +238,44 @@ class TrackingTask(ClockedTask):
         character: Character,
         arena: PlanarArena | SpatialArena,
         motion: Clip | FootstepLibrary,
-        typical_poses: np.ndarray,
-        config: PlanarConfig | SpatialConfig,
+        config: Any = None,
         *,
-        period: float,
         actuation_model: str = 'position',
-        phase: bool = True,
-        extras: tuple[Block, ...],
-        hidden: Collection[str] = (),
     ) -> None:
-        """Composes the task; see `ClockedTask` and the subclasses.
+        """Composes the task.
 
         Args:
-          character, arena, motion, typical_poses, period, actuation_model: see `ClockedTask`.
-          config: the options.
-          phase: whether the phase is observed.
-          extras: the blocks of a subclass.
-          hidden: names of blocks that are not observed.
+          character: a character without actuators; it is attached to the arena.
+          arena: the arena with its terrain, planar or spatial as the character.
+          motion: the reference motion: a looping clip, or a library of single steps, for this
+            character.
+          config: the options, a `CONFIG` of the class; by default the defaults.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
           ValueError: incompatible options, or a motion that does not fit the character.
         """
+        config = self.CONFIG() if config is None else config
         self.mirrored = mirrored = getattr(config, 'mirrored', False)
         if mirrored and not character.spec.mirror:
             raise ValueError(
                 f'character {character.spec.name!r} has no pairs of right and left links; mirrored '
                 'observations need them'
             )
+        phase = not getattr(config, 'reference_observation', False)
         if mirrored and not phase:
             raise ValueError(
                 'mirrored observations need the phase, which determines the stance foot'
             )
-        names = {block.name for block in extras}
+        extras, hidden = self._further_blocks(character, config), self.hidden
         super().__init__(
             character,
             arena,
             motion,
-            typical_poses,
             config,
-            period=period,
-            actuation_model=actuation_model,
+            actuation_model,
             terrain_observation=config.terrain_observation,
-            contact='contact' in names,
+            contact='contact' in {block.name for block in extras},
         )
         self.action_map = self.joint_map
         self._start_phase = start_phases(config.start_phase)
@@ -281,6 +296,10 @@ class TrackingTask(ClockedTask):
             )
         self.observed = tuple(block.mirrored() for block in given) if mirrored else given
 
+    @abc.abstractmethod
+    def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
+        """Returns the blocks that follow those of the body and the phase."""
+
     def _reflected(self, blocks: tuple[Block, ...]) -> Mirror | None:
         """Returns the reflection of these blocks and of actions; None if there is none."""
         slices, spec = layout(blocks), self.character.spec
@@ -289,17 +308,19 @@ class TrackingTask(ClockedTask):
         actions = action_reflection(self.character, self.action_map)
         return Mirror(*reflected(blocks), *actions, slices['phase'].start)
 
-    @abc.abstractmethod
     def _track(self) -> Reference:
         """Returns the reference, after the body was bound."""
+        motion, model = self.motion, self.world.models[0]
+        if isinstance(motion, Clip):
+            return Reference.of_clip(motion, self.figure, model, self.tracks)
+        return Reference.of_steps(motion, self.figure, model)
 
-    def _bind_tracking(self, world: World) -> TrackingData:
-        """Binds body, reference and full observation."""
-        self._bind_clock(world)
+    def _bind(self, world: World) -> Any:
+        """Binds body, reference and full observation; returns the `TrackingData`."""
         full = self.outcome.observation
         if self.observed != self.full:
             full = np.zeros((world.n, sum(block.size for block in self.full)))
-            self.saved = (*self.saved, Full(full))
+            self.saved = (*self.saved, by_name('Full', {'observation': full}))
         self.figure.bind(world, self.joint_map, full, self.full, self.ABOUT)
         self.reference = self._track()
         none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
@@ -324,7 +345,7 @@ class TrackingTask(ClockedTask):
             clock=self.clock,
             travel=self.travel,
             period=self.period,
-            along=self.along or not self.character.spec.spatial,
+            along=self.along or not self._spatial,
             comparison=comparison(self.character, self.reference, self.terms),
         )
 
@@ -334,49 +355,34 @@ class TrackingTask(ClockedTask):
             action = self._view.action
         self.figure.control(env_ids, action)
 
-    def _begin_grounds(
+    def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> np.ndarray:
-        """Draws phase, ground, random stream and spawn of simulations; returns spawns, (m, 3)."""
-        origin = self.travel.origin
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
             # Drawn even if start_phase is a constant, so that the terrain does not depend on it.
             self.clock.start[i] = self._start_phase(random_state.random_sample())
-            ground = self._ground(i, self.terrain_seed(i, random_state))
+            seed, random = self.terrain_seed(i, random_state), None
             if self.draws:
-                self._random[i] = np.random.default_rng(drawn_seed(random_state))
-            if isinstance(ground, PlanarGround):
-                self.arena.begin_episode(i, ground)
-                continue
-            if self.draws:
-                origin[i] = ground.spawn(self._random[i])
-            self.arena.begin_episode(i, ground, origin[i, :2])
+                random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
+            self._begin_ground(i, seed, random)
         self._begin_clocks(env_ids)
-        return origin[env_ids]
+        motion, phase, spawns = self.motion, self.clock.start[env_ids], self.travel.origin[env_ids]
+        if isinstance(motion, FootstepLibrary):
+            return *pose_of_step(motion, self._first, self.phase[env_ids]), spawns
+        if not self._spatial:
+            share = self.tracks * phase
+            track = np.floor(share)
+            return self.reference.planar_state(share - track, track.astype(int))
+        poses, rates = motion.state(phase * self.period)
+        poses[:, :2] = 0.0
+        return poses, rates, spawns
 
-    def _ground(self, i: int, seed: np.random.SeedSequence) -> PlanarGround | SpatialGround:
-        """Returns the ground of an episode."""
-        terrain, level = self.arena.terrain, self.config.terrain_level
-        if self.character.spec.spatial:
-            return SpatialGround(terrain, seed, terrain_level=level)
+    def _flat(self, i: int) -> dict[str, Any]:
         spawn, centre = self.config.spawn, 0.0
         if spawn == 'upstream':
             # The boundary of the original's segments: it builds them before it moves the root to 0.
-            assert isinstance(self.motion, Clip)
-            centre = self.motion.pose(self.clock.start[i : i + 1] * self.period)[0, 0] - 0.5
-        return PlanarGround(terrain, seed, terrain_level=level, spawn=spawn, centre=centre)
-
-    def _clip_start(self, env_ids: np.ndarray, spawns: np.ndarray, tracks: int = 1) -> Any:
-        """Returns poses, rates, and extents or spawns, of a clip at `clock.start`."""
-        assert isinstance(self.motion, Clip)
-        phase = self.clock.start[env_ids]
-        if not self.character.spec.spatial:
-            share = tracks * phase
-            track = np.floor(share)
-            return self.reference.planar_state(share - track, track.astype(int))
-        poses, rates = self.motion.state(phase * self.period)
-        poses[:, :2] = 0.0
-        return poses, rates, spawns
+            centre = self.clip.pose(self.clock.start[i : i + 1] * self.period)[0, 0] - 0.5
+        return {'spawn': spawn, 'centre': centre}
 
     def clip_action(self, env_id: int) -> np.ndarray:
         """Returns the action that moves the joints along the clip, in open loop.
@@ -408,12 +414,6 @@ class TrackingTask(ClockedTask):
         height = 2 if self.character.spec.spatial else 1
         pose[height] += self.figure.heights(np.array([env_id]), place)[0]
         return pose
-
-
-class Full(NamedTuple):
-    """The full observation, as part of the state of a task, (n, size)."""
-
-    observation: np.ndarray
 
 
 class View(NamedTuple):
@@ -449,7 +449,7 @@ class TrackingData(NamedTuple):
       measurement: of the bodies, which write their own blocks to `given.full`.
       diverged: whether the physics has diverged in the last step, (n,).
       period: that of the motion, s.
-      along: whether the distance travelled is along +x, not in any horizontal direction.
+      along: whether the distance travelled is along the heading at the start, not in any direction.
     """
 
     measurement: Measurement
@@ -465,10 +465,11 @@ class TrackingData(NamedTuple):
 
 @compiled
 def proceed(i: int, data: TrackingData) -> bool:
-    """Advances clock and distance; returns False if the physics has diverged."""
+    """Advances clock and distance; returns False if the physics has diverged: the step has failed."""
     tick(i, data.period, data.clock)
     data.outcome.diverged[i] = data.diverged[i]
-    if data.diverged[i]:
+    if data.diverged[i]:  # keeps the last finite observation
+        conclude(i, True, data.outcome)
         return False
     go(i, data.along, data.measurement, data.travel)
     return True

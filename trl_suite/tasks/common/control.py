@@ -9,22 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.actuation import character_muscles
+from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.bodies.reference import joint_targets, mean_targets
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.task import (
-    ACTION_OFFSETS,
-    MOST_SAMPLES,
-    MOST_SUBSTEPS,
-    SPAWNS,
-    START_PHASE,
-    SUBSTEPS,
-    TERRAIN_LEVEL,
-)
 from trl_suite.util import errors
 from trl_suite.util.options import Config, option
 
-HEIGHT_MAP = "observed map of the terrain: 'height', or () for none"
+MOST_SUBSTEPS = 1000  # physics steps per control step
+MOST_SAMPLES = 10_000  # heights observed on a line
+SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
+ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 ACTION_SCALE = 1.0  # rad per unit action about the mean pose of a spatial motion
 TYPICAL_POSES = 256  # poses of a cycle; their mean is action 0 of position control
 
@@ -39,14 +35,79 @@ def planar_heights() -> Any:
     )
 
 
+def height_map(default: str | tuple[str, ...] = ()) -> Any:
+    """Returns the option of a map of the terrain in three dimensions."""
+    meaning = "observed map of the terrain: 'height', or () for none"
+    return option(default, meaning, choices=('height',))
+
+
+def physics_steps(least: int) -> Any:
+    """Returns the option of physics steps per control step."""
+    meaning = 'physics steps per control step of 1/30 s'
+    return option(SUBSTEPS, meaning, at_least=least, at_most=MOST_SUBSTEPS)
+
+
+def joint_angle(by_default: str) -> Any:
+    """Returns the option of the scale of actions of position control."""
+    meaning = f'joint angle per unit action{by_default}'
+    return option(None, meaning, unit='rad', above=0, actuation='position')
+
+
+def flat_ground() -> Any:
+    """Returns the option of where the ground is flat at the start, in the plane."""
+    return option(
+        'intended',
+        "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
+        "'upstream', as in the original",
+        choices=('intended', 'upstream'),
+    )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanarConfig(Config):
+class GroundConfig(Config):
+    """Options of tasks on random ground; `terrain_observation` is an option of the subclass."""
+
+    terrain_level: float = option(
+        0.0,
+        "index of the terrain's parameter set; fractions interpolate: 0.5 is half-way between sets 0 and 1",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        observed = getattr(self, 'terrain_observation', ())
+        if observed == 1:
+            raise ValueError('terrain_observation is 1; expected 0, or at least 2 heights')
+        if isinstance(observed, (str, Collection)):
+            names = (observed,) if isinstance(observed, str) else tuple(observed)
+            self._set('terrain_observation', names)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackingConfig(GroundConfig):
+    """Options of tasks that track a motion."""
+
+    start_phase: float | Sequence[Sequence[float]] | None = option(
+        None,
+        'phase at the start of an episode, in [0, 1), or pairs of bounds between which it is drawn; by '
+        'default drawn from [0, 1)',
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        start_phases(self.start_phase)
+        if (
+            getattr(self, 'action_offset', None) == 'original'
+            and getattr(self, 'action_scale', None) is not None
+        ):
+            raise ValueError("action_offset 'original' has fixed ranges: it takes no action_scale")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarConfig(TrackingConfig):
     """Options of tasks that track a clip in the plane."""
 
     terrain_observation: int = planar_heights()
-    substeps: int = option(
-        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
-    )
+    substeps: int = physics_steps(4)
     action_offset: str = option(
         'clip',
         "pose at action 0: the mean pose of the clip ('clip'), or the working posture ('posture'); "
@@ -54,37 +115,16 @@ class PlanarConfig(Config):
         choices=ACTION_OFFSETS,
         actuation='position',
     )
-    action_scale: float | None = option(
-        None,
-        'joint angle per unit action; by default 1.5',
-        unit='rad',
-        above=0,
-        actuation='position',
-    )
-    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
-    spawn: str = option(
-        'intended',
-        "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
-        "'upstream', as in the original",
-        choices=SPAWNS,
-    )
-    terrain_level: float = option(0.0, TERRAIN_LEVEL)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.terrain_observation == 1:
-            raise ValueError('terrain_observation is 1; expected 0, or at least 2 heights')
-        start_phases(self.start_phase)
+    action_scale: float | None = joint_angle('; by default 1.5')
+    spawn: str = flat_ground()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SpatialConfig(Config):
+class SpatialConfig(TrackingConfig):
     """Options of tasks that track a motion in three dimensions."""
 
-    terrain_observation: str | Collection[str] = option((), HEIGHT_MAP, choices=('height',))
-    substeps: int = option(
-        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6, at_most=MOST_SUBSTEPS
-    )
+    terrain_observation: str | Collection[str] = height_map()
+    substeps: int = physics_steps(6)
     action_offset: str = option(
         'clip',
         "pose at action 0: the mean pose of the reference motion, made symmetric ('clip'), or the working "
@@ -92,22 +132,9 @@ class SpatialConfig(Config):
         choices=ACTION_OFFSETS,
         actuation='position',
     )
-    action_scale: float | None = option(
-        None,
-        "joint angle per unit action; by default 1 with action_offset 'clip', 1.5 with 'posture'",
-        unit='rad',
-        above=0,
-        actuation='position',
+    action_scale: float | None = joint_angle(
+        "; by default 1 with action_offset 'clip', 1.5 with 'posture'"
     )
-    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
-    terrain_level: float = option(0.0, TERRAIN_LEVEL)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set('terrain_observation', maps(self.terrain_observation))
-        start_phases(self.start_phase)
-        if self.action_offset == 'original' and self.action_scale is not None:
-            raise ValueError("action_offset 'original' has fixed ranges: it takes no action_scale")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,11 +145,6 @@ class MirroredConfig(SpatialConfig):
         False,
         'mirror observations and actions in left stance, so that every step is in right stance',
     )
-
-
-def maps(names: str | Collection[str]) -> tuple[str, ...]:
-    """Returns one or several names of maps as a tuple."""
-    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def check_motion(character: Character, motion: Clip | FootstepLibrary) -> None:
@@ -146,44 +168,62 @@ def check_motion(character: Character, motion: Clip | FootstepLibrary) -> None:
         )
 
 
-def check_cycle(clip: Clip) -> None:
-    """Checks that a clip loops.
+def cycle_poses(clip: Clip) -> np.ndarray:
+    """Returns poses of a cycle, whose mean is action 0 of position control, (k, columns).
 
     Raises:
-      ValueError: it does not.
+      ValueError: the clip does not loop.
     """
     if not clip.loop:
         raise ValueError(
             f'clip {clip.name!r} is not looping: the task tracks no clip that does not loop'
         )
-
-
-def cycle_poses(clip: Clip) -> np.ndarray:
-    """Returns poses of a cycle, whose mean is action 0 of position control, (k, columns)."""
     return clip.pose(np.linspace(0, clip.duration, TYPICAL_POSES, endpoint=False))
 
 
-def position_range(
+def joint_options(
     character: Character,
-    motion: Clip | FootstepLibrary,
-    typical_poses: np.ndarray,
-    action_offset: str,
-    action_scale: float | None,
-) -> dict[str, Any]:
-    """Returns the arguments of position control for an action_offset and an action_scale."""
-    spatial = character.spec.spatial
-    if action_offset == 'original':
-        return {'rotations': 'angle_axis'} if spatial else original_range(character, action_scale)
-    options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}
-    if action_offset == 'clip' and spatial:
-        options.setdefault('action_scale', ACTION_SCALE)
-        options['action_offset'] = mean_targets(typical_poses, motion)
-    elif action_offset == 'clip':
-        options['action_offset'] = joint_targets(motion, typical_poses).mean(0)
-    return options
+    config: Any,
+    model: str,
+    motion: Clip | FootstepLibrary | None,
+    typical: Any,
+) -> tuple[dict[str, Any], tuple[Muscle, ...]]:
+    """Returns the options of `actuation.add` for an actuation model, and the muscles.
+
+    Args:
+      character: the character.
+      config: the options of the task, of which some are for one actuation model only.
+      model: the actuation model.
+      motion: the motion, if there is one.
+      typical: its poses whose mean is action 0 of position control, (k, columns of a pose).
+
+    Raises:
+      ValueError: an option that is for another actuation model.
+    """
+    offset, scale = getattr(config, 'action_offset', 'clip'), getattr(config, 'action_scale', None)
+    muscle_set = getattr(config, 'muscle_set', PLAIN)
+    if model != 'position' and (offset != 'clip' or scale is not None):
+        raise ValueError(
+            f'action_offset and action_scale are options of position control, not {model} control'
+        )
+    if model == 'muscle':
+        return {'muscle_set': muscle_set}, character_muscles(character, muscle_set)
+    if muscle_set != PLAIN:
+        raise ValueError(f'muscle_set is an option of muscle control, not {model} control')
+    options: dict[str, Any] = {}
+    if model == 'position' and offset == 'original':
+        options = {'rotations': 'angle_axis'} if character.spec.spatial else _original(character)
+    elif model == 'position':
+        options = {} if scale is None else {'action_scale': scale}
+        if offset == 'clip' and motion is not None and character.spec.spatial:
+            options = {'action_scale': ACTION_SCALE, **options}
+            options['action_offset'] = mean_targets(typical, motion)
+        elif offset == 'clip' and motion is not None:
+            options['action_offset'] = joint_targets(motion, typical).mean(0)
+    return options, ()
 
 
-def original_range(character: Character, action_scale: float | None) -> dict[str, Any]:
+def _original(character: Character) -> dict[str, Any]:
     """Returns action_offset and action_scale of the original in the plane, rad."""
     ranges = np.array(
         [
@@ -195,8 +235,7 @@ def original_range(character: Character, action_scale: float | None) -> dict[str
     )
     free = ~np.isfinite(ranges).all(1)
     ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
-    scale = 2 * (ranges[:, 1] - ranges[:, 0]) if action_scale is None else action_scale
-    return {'action_offset': ranges.mean(1), 'action_scale': scale}
+    return {'action_offset': ranges.mean(1), 'action_scale': 2 * (ranges[:, 1] - ranges[:, 0])}
 
 
 def start_phases(
@@ -238,15 +277,3 @@ def start_phases(
         return float(pairs[i, 1] - (ends[i] - covered))
 
     return phase_of
-
-
-def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
-    """Checks that options of position control are only given with this actuation model.
-
-    Raises:
-      ValueError: they are given with another one.
-    """
-    if model != 'position' and (action_offset != 'clip' or action_scale is not None):
-        raise ValueError(
-            f'action_offset and action_scale are options of position control, not {model} control'
-        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -122,3 +122,10 @@ def missed(task: Any) -> str:
     if task.max_landing_error is None:
         return ''
     return f'a foot lands more than {task.max_landing_error:g} m from its landing place; '
+
+
+def imitation(spec: EnvSpec, task: Any) -> Iterator[Section]:
+    """Yields the sections on clip, reward and termination."""
+    yield clip(task)
+    yield reward(task)
+    yield fall(task)

@@ -102,14 +102,12 @@ def land(i: int, data: FootstepData) -> bool:
 
 @compiled
 def finish(i: int, data: FootstepData) -> None:
-    """Computes reward, failure and observation."""
+    """Computes reward, failure and observation, unless the physics has diverged."""
     outcome = data.tracking.outcome
-    if outcome.diverged[i]:  # keeps the last finite observation
-        conclude(i, True, outcome)
-        return
-    compare(i, data)
-    conclude(i, data.tracking.measurement.fallen[i] or data.state.missed[i], outcome)
-    observe(i, data)
+    if not outcome.diverged[i]:
+        compare(i, data)
+        conclude(i, data.tracking.measurement.fallen[i] or data.state.missed[i], outcome)
+        observe(i, data)
 
 
 @compiled

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import Measurement
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Reference
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
-from trl_suite.motion import Clip, FootstepLibrary, quaternion, step_features
-from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig, check_cycle, cycle_poses
+from trl_suite.motion import quaternion, step_features
+from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     LEFT,
@@ -31,9 +31,6 @@ from trl_suite.tasks.common.footstep_plan import (
     Planned,
     check_two_feet,
     plan_markers,
-    pose_of_step,
-    straight_step,
-    typical_poses,
 )
 from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
 from trl_suite.tasks.footsteps.planner import (
@@ -56,7 +53,6 @@ from trl_suite.tasks.footsteps.rules import (
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.tasks.variation.pushes import PushConfig, Pushes
-from trl_suite.util.compiled import packed
 from trl_suite.util.options import Range, option
 
 PUSHES = {'force': (50.0, 150.0), 'duration': (0.2, 0.4), 'interval': (1.0, 2.0)}  # defaults
@@ -121,12 +117,13 @@ class Footsteps(Planned, TrackingTask):
     """
 
     ABOUT = 'root'
+    finish_all, observe_all = finish_all, observe_all
     plans: Any  # Plans or StraightPlans
     goal_given = hidden_plan = False
     _grace_steps = 0
 
-    def bind(self, world: World) -> None:
-        tracking, n, config = self._bind_tracking(world), world.n, self.config
+    def _bind(self, world: World) -> FootstepData:
+        tracking, n, config = super()._bind(world), world.n, self.config
         self.plan, self.state = allocated(FootstepPlan, n), allocated(FootstepState, n)
         self.saved = (*self.saved, self.plan, self.state)
         self.info_arrays |= {
@@ -143,16 +140,15 @@ class Footsteps(Planned, TrackingTask):
             grace_steps=self._grace_steps,
         )
         limit = config.max_landing_error
-        data = FootstepData(
+        return FootstepData(
             tracking=tracking,
             plan=self.plan,
             state=self.state,
-            turns=self.character.spec.spatial,
+            turns=self._spatial,
             footstep_scales=np.atleast_1d(config.footstep_scale).astype(float),
             heading_scale=float(getattr(config, 'heading_scale', 1.0)),
             largest_miss=np.inf if limit is None else float(limit),
         )
-        self._pack = packed(data)
 
     def _drawn_plans(self) -> Plans:
         """Returns how plans are drawn, of spatial characters and of planar ones."""
@@ -196,70 +192,37 @@ class Footsteps(Planned, TrackingTask):
             switched = env_ids[self.plan.landed[env_ids]]
             self._planner.replan(switched, measurement)
             align_all(switched, self._choose(switched, measurement), self._pack)
-            finish_all(switched, self._pack)
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        env_ids = self.world.all_ids if env_ids is None else env_ids
-        self.figure.measure(env_ids)
-        observe_all(env_ids, self._pack)
+            self.finish_all(switched, self._pack)
 
 
 class SpatialFootsteps(Footsteps):
-    """A spatial biped tracks a plan of footsteps.
+    """A spatial biped tracks a plan of footsteps, with a library of single steps of this character.
+
+    Episodes start from the straight step whose length is nearest to the planned one.
 
     With the option `mirrored`, observations and actions are reflected in left stance; the phase is
     then that of the single step, and the plan has only the landing places that are not 0.
     """
 
     terms = TERMS
-
     CONFIG: Any = SpatialFootstepsConfig
 
-    def __init__(
-        self,
-        character: Character,
-        arena: SpatialArena,
-        steps: FootstepLibrary,
-        config: SpatialFootstepsConfig = SpatialFootstepsConfig(),
-        *,
-        actuation_model: str = 'position',
-    ) -> None:
-        """Composes the task.
+    def __init__(self, character: Character, *args: Any, **kwargs: Any) -> None:
+        """Composes the task; the arguments are those of `TrackingTask`."""
+        super().__init__(character, *args, **kwargs)
+        pushes = self.config.pushes
+        if pushes is not None:
+            body = pushes.body or character.spec.links[1]  # the torso
+            self.add(Pushes(dataclasses.replace(pushes, body=body)))
 
-        Args:
-          character: a spatial biped without actuators; it is attached to the arena.
-          arena: the arena with its terrain.
-          steps: library of single steps of this character; the clock has the period of two steps.
-          config: the options; with action_offset 'clip', action 0 is the mean pose of a straight
-            step.
-          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-
-        Raises:
-          ValueError: incompatible options, or steps that do not fit the character.
-        """
+    def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         check_two_feet(character.spec)
-        self.plans, self.steps = config.plans, steps
+        self.plans = config.plans
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
+        self.hidden = ('contact', 'plan') if config.hidden_plan else ()
         self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
-        # Episodes start from the straight step whose length is nearest to the planned one.
-        self._first = straight_step(steps, float(np.mean(self.plans.length)))
-        super().__init__(
-            character,
-            arena,
-            steps,
-            typical_poses(steps, self._first),
-            config,
-            period=2 * steps.duration,
-            actuation_model=actuation_model,
-            extras=(CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)),
-            hidden=('contact', 'plan') if config.hidden_plan else (),
-        )
-        if config.pushes is not None:
-            body = config.pushes.body or character.spec.links[1]  # the torso
-            self.add(Pushes(dataclasses.replace(config.pushes, body=body)))
-
-    def _track(self) -> Reference:
-        return Reference.of_steps(self.steps, self.figure, self.world.models[0])
+        self.length = float(np.mean(self.plans.length))
+        return CONTACT, PLAN, GOAL.observed_if(config.hidden_plan)
 
     @property
     def goal(self) -> np.ndarray:
@@ -267,12 +230,6 @@ class SpatialFootsteps(Footsteps):
         return self.state.goal
 
     # Episodes.
-
-    def _start(
-        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = self._begin_grounds(env_ids, random_states)
-        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         super()._begun_on_ground(env_ids)
@@ -334,55 +291,26 @@ class SpatialFootsteps(Footsteps):
 
 
 class PlanarFootsteps(Footsteps):
-    """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip."""
+    """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip.
+
+    The clip has two steps, with right stance first.
+    """
 
     terms = PLANAR_TERMS
-
     CONFIG: Any = PlanarFootstepsConfig
+    tracks = 2
 
-    def __init__(
-        self,
-        character: Character,
-        arena: PlanarArena,
-        clip: Clip,
-        config: PlanarFootstepsConfig = PlanarFootstepsConfig(),
-        *,
-        actuation_model: str = 'position',
-    ) -> None:
-        """Composes the task.
-
-        Args:
-          character: a planar character with a right and a left foot, without actuators; it is
-            attached to the arena.
-          arena: the arena with its terrain.
-          clip: a looping planar clip of two steps for this character, with right stance first.
-          config: the options.
-          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-
-        Raises:
-          ValueError: incompatible options, a character without two feet, or a clip that does not
-            fit it; `bind` raises it for a clip with left stance first.
-        """
+    def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         check_feet(character.spec)
-        check_cycle(clip)
-        self.clip, self.plans = clip, config.plans
-        super().__init__(
-            character,
-            arena,
-            clip,
-            cycle_poses(clip),
-            config,
-            period=clip.duration,
-            actuation_model=actuation_model,
-            extras=(CONTACT, PLAN, GOAL.observed_if(False)),
-        )
+        self.plans = config.plans
+        return CONTACT, PLAN, GOAL.observed_if(False)
 
     def _drawn_plans(self) -> Plans:
         length, change = self.plans.length, self.plans.change
         return Plans(length=length, change=change, width=Range(0.0, 0.0), turn=0.0, sharp=0.0)
 
     def _track(self) -> Reference:
-        reference = Reference.of_clip(self.clip, self.figure, self.world.models[0], tracks=2)
+        reference = super()._track()
         shares, columns = np.arange(32) / 32, reference.columns['effectors']
         halves = [reference.features(shares, np.full(32, half))[:, columns] for half in (0, 1)]
         # Right above left foot, by halves.
@@ -394,11 +322,6 @@ class PlanarFootsteps(Footsteps):
                 'clip.mirrored()'
             )
         return reference
-
-    def _start(
-        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self._clip_start(env_ids, self._begin_grounds(env_ids, random_states), tracks=2)
 
     def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
         return self.stance[env_ids]

@@ -23,6 +23,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
+from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, flat_ground
 from trl_suite.tasks.gait.rules import (
     _GROUND,
     _LOOK,
@@ -44,20 +45,14 @@ from trl_suite.tasks.gait.rules import (
     run,
 )
 from trl_suite.tasks.rewards import terms_data
-from trl_suite.tasks.task import (
-    MOST_SUBSTEPS,
-    SPAWNS,
-    TERRAIN_LEVEL,
-    Task,
-    check_simulated,
-)
+from trl_suite.tasks.task import Task, check_simulated
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import packed
-from trl_suite.util.options import Config, option
+from trl_suite.util.options import option
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GaitConfig(Config):
+class GaitConfig(GroundConfig):
     """Options of `GaitTask`."""
 
     interface: str = option(
@@ -77,13 +72,7 @@ class GaitConfig(Config):
     substeps: int = option(
         SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1, at_most=MOST_SUBSTEPS
     )
-    spawn: str = option(
-        'intended',
-        "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
-        "'upstream', as in the original",
-        choices=SPAWNS,
-    )
-    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+    spawn: str = flat_ground()
     start_noise: float = option(
         0.0,
         'standard deviation of the noise on joint angles at the start; that on joint rates (rad/s) and '

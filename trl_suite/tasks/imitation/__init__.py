@@ -2,14 +2,14 @@
 
 from trl_suite.motion import Clip
 from trl_suite.tasks import task_type as differences
-from trl_suite.tasks.imitation.description import IMITATION
+from trl_suite.tasks.common import description
 from trl_suite.tasks.imitation.task import (
     PlanarImitation,
     PlanarImitationConfig,
     SpatialImitation,
     SpatialImitationConfig,
 )
-from trl_suite.tasks.task_type import Difference, TaskType, tracking
+from trl_suite.tasks.task_type import Description, Difference, TaskType, tracking
 
 TYPES = (
     TaskType(
@@ -18,7 +18,7 @@ TYPES = (
         spatial=False,
         config=PlanarImitationConfig,
         make=tracking(PlanarImitation),
-        description=IMITATION,
+        description=Description(rules=description.imitation),
         motion=Clip,
         differences=(
             Difference(
@@ -38,7 +38,7 @@ TYPES = (
         spatial=True,
         config=SpatialImitationConfig,
         make=tracking(SpatialImitation),
-        description=IMITATION,
+        description=Description(rules=description.imitation),
         motion=Clip,
         differences=(
             differences.FROM_3000, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,

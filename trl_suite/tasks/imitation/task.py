@@ -8,21 +8,17 @@ motion control' (Berseth et al. 2018).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite.actuation.muscles import PLAIN
-from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import go
-from trl_suite.bodies.reference import Reference, feature, moment, observe_phase
+from trl_suite.bodies.reference import feature, moment, observe_phase
 from trl_suite.characters import Character
-from trl_suite.engine import World
-from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
-from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig, check_cycle, cycle_poses
+from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig
 from trl_suite.tasks.common.goals import GOAL, observe_place
 from trl_suite.tasks.rewards import (
     com_error,
@@ -32,7 +28,7 @@ from trl_suite.tasks.rewards import (
     score_tracking,
 )
 from trl_suite.tasks.tracking import TrackingData, TrackingTask, proceed, publish
-from trl_suite.util.compiled import compiled, packed
+from trl_suite.util.compiled import compiled
 from trl_suite.util.options import option
 
 GOAL_AHEAD = (
@@ -41,18 +37,7 @@ GOAL_AHEAD = (
 REFERENCE = 'observe the state of the reference instead of the phase'
 
 
-# A step of simulation i, in order, after the body was measured.
-
-
-@compiled
-def finish_step(i: int, data: TrackingData) -> None:
-    """Computes reward, failure and observation."""
-    if not proceed(i, data):
-        conclude(i, True, data.outcome)
-        return
-    compare(i, data)
-    conclude(i, data.measurement.fallen[i], data.outcome)
-    observe(i, data)
+# A step of simulation i, after the body was measured.
 
 
 @compiled
@@ -109,10 +94,13 @@ def motion_blocks(character: Character, reference: bool) -> tuple[Block, ...]:
 
 
 @compiled
-def finish_steps(env_ids: np.ndarray, data: TrackingData) -> None:
-    """Finishes steps."""
+def finish_all(env_ids: np.ndarray, data: TrackingData) -> None:
+    """Finishes steps: computes reward, failure and observation."""
     for i in env_ids:
-        finish_step(i, data)
+        if proceed(i, data):
+            compare(i, data)
+            conclude(i, data.measurement.fallen[i], data.outcome)
+            observe(i, data)
 
 
 @compiled
@@ -148,71 +136,18 @@ class Imitation(TrackingTask):
     """A character tracks a looping clip along +x, over random terrain."""
 
     terms = rewards.IMITATION_TERMS
+    finish_all, observe_all = finish_all, observe_all
     draws = False
     along = True
 
-    def __init__(
-        self,
-        character: Character,
-        arena: PlanarArena | SpatialArena,
-        clip: Clip,
-        config: PlanarImitationConfig | SpatialImitationConfig | None = None,
-        *,
-        actuation_model: str = 'position',
-    ) -> None:
-        """Composes the task.
-
-        Args:
-          character: a character without actuators; it is attached to the arena.
-          arena: the arena with its terrain, planar or spatial as the character.
-          clip: a looping clip for this character.
-          config: the options; by default the defaults.
-          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-
-        Raises:
-          ValueError: incompatible options, or a clip that does not fit the character.
-        """
-        check_cycle(clip)
-        config = self.CONFIG() if config is None else config
-        assert config is not None
-        self.clip, reference = clip, config.reference_observation
-        super().__init__(
-            character,
-            arena,
-            clip,
-            cycle_poses(clip),
-            config,
-            period=clip.duration,
-            actuation_model=actuation_model,
-            phase=not reference,
-            extras=motion_blocks(character, reference),
-        )
-
-    def bind(self, world: World) -> None:
-        self._pack = packed(self._bind_tracking(world))
-
-    def _track(self) -> Reference:
-        return Reference.of_clip(self.clip, self.figure, self.world.models[0])
-
-    def _start(
-        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self._clip_start(env_ids, self._begin_grounds(env_ids, random_states))
-
-    def finish_step(self, env_ids: np.ndarray) -> None:
-        self.figure.measure(env_ids, stepped=True)
-        finish_steps(env_ids, self._pack)
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        env_ids = self.world.all_ids if env_ids is None else env_ids
-        self.figure.measure(env_ids)
-        observe_all(env_ids, self._pack)
+    def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
+        return motion_blocks(character, config.reference_observation)
 
     def reference_pose(self, env_id: int) -> np.ndarray:
         """Returns the pose of the reference from the same start: root, then joints."""
         cycles = np.array([self.clock.start[env_id], self.cycles[env_id]])
         first, pose = self.clip.pose(cycles * self.period)
-        level = 2 if self.character.spec.spatial else 1
+        level = 2 if self._spatial else 1
         pose[:level] += self.travel.origin[env_id, :level] - first[:level]
         return self._on_ground(env_id, pose)
 

@@ -5,7 +5,7 @@ from typing import Any
 from trl_suite import motion
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.tasks import task_type as differences
-from trl_suite.tasks.common.ball import Ball
+from trl_suite.tasks.common.goals import Ball
 from trl_suite.tasks.navigation import description
 from trl_suite.tasks.navigation.direct import (
     DirectConfig,

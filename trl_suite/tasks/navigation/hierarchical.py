@@ -21,16 +21,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.motion import FootstepLibrary
-from trl_suite.tasks.common.ball import (
-    AT_GOAL,
-    BALL,
-    BALL_GOAL,
-    Ball,
-    goal_disc,
-    no_ball,
-    soccer_terms,
-)
-from trl_suite.tasks.common.control import maps
+from trl_suite.tasks.common.control import MOST_SUBSTEPS, SUBSTEPS, GroundConfig
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
@@ -39,11 +30,16 @@ from trl_suite.tasks.common.footstep_plan import (
     check_two_feet,
     plan_markers,
     pose_of_step,
-    straight_step,
-    typical_poses,
 )
-from trl_suite.tasks.common.goals import GOAL, GoalDrawer, Goals, flag, trace, trace_markers
-from trl_suite.tasks.footsteps.planner import Plans
+from trl_suite.tasks.common.goals import (
+    AT_GOAL,
+    BALL,
+    BALL_GOAL,
+    GOAL,
+    Ball,
+    GoalTask,
+    soccer_terms,
+)
 from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,
@@ -69,24 +65,14 @@ from trl_suite.tasks.navigation.plan_actions import (
     planning_mirror,
 )
 from trl_suite.tasks.rewards import terms_data
-from trl_suite.tasks.task import (
-    MOST_SUBSTEPS,
-    SUBSTEPS,
-    TERRAIN_LEVEL,
-    Marker,
-    check_simulated,
-    drawn_seed,
-)
-from trl_suite.tasks.tracking import ClockedTask
-from trl_suite.terrain import SpatialGround
-from trl_suite.util.compiled import packed
-from trl_suite.util.options import Config, Range, option
+from trl_suite.tasks.task import Marker, check_simulated, drawn_seed
+from trl_suite.util.options import Range, option
 
 TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class HierarchicalConfig(Config):
+class HierarchicalConfig(GroundConfig):
     """Options of `HierarchicalNavigation`."""
 
     controller: Any = option(
@@ -135,14 +121,9 @@ class HierarchicalConfig(Config):
         below=1,
     )
     substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6, at_most=MOST_SUBSTEPS)
-    terrain_level: float = option(0.0, TERRAIN_LEVEL)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set('terrain_observation', maps(self.terrain_observation))
 
 
-class HierarchicalNavigation(Planned, ClockedTask):
+class HierarchicalNavigation(Planned, GoalTask):
     """A spatial biped walks from goal to goal, or dribbles a ball to them, by planning footsteps.
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
@@ -155,7 +136,9 @@ class HierarchicalNavigation(Planned, ClockedTask):
       watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """
 
-    ABOUT = 'root'
+    ABOUT, RULE = 'root', 'far'
+    length = 0.5
+    observe_all = observe_all
     watch: Callable[[], None] | None = None
 
     CONFIG: Any = HierarchicalConfig
@@ -181,11 +164,9 @@ class HierarchicalNavigation(Planned, ClockedTask):
           ValueError: parts that are incompatible.
         """
         check_two_feet(character.spec)
-        self.steps, self.ball = steps, ball
-        self._first = straight_step(steps, float(np.mean(Plans().length)))
+        self.ball, self.goal_distance = ball, config.goal_distance
         self.terms = soccer_terms() if ball else NAVIGATION_TERMS
-        typical = typical_poses(steps, self._first)
-        super().__init__(character, arena, steps, typical, config, period=2 * steps.duration)
+        super().__init__(character, arena, steps, config, 'position')
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
         blocks = *self.figure.blocks, PHASE, CONTACT, PLAN
@@ -201,7 +182,6 @@ class HierarchicalNavigation(Planned, ClockedTask):
         self.goal_reached = (
             (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
-        self._goal_drawer = GoalDrawer(arena, ball, 'far', config.goal_distance)
         self.steps_vary = by_plan = self.interface == 'plan'
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
@@ -229,105 +209,65 @@ class HierarchicalNavigation(Planned, ClockedTask):
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
 
-    def bind(self, world: World) -> None:
-        self._bind_clock(world)
-        n = world.n
-        self.plan, self.goals = allocated(FootstepPlan, n), allocated(Goals, n)
-        self.state, self.trace = allocated(PlanningState, n), trace(n)
-        self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
+    def _bind(self, world: World) -> PlanningData:
+        n, blocks = world.n, self._controller_blocks
+        self.plan, self.state = allocated(FootstepPlan, n), allocated(PlanningState, n)
+        self.saved = (*self.saved, self.plan, self.state)
+        aims = self._bind_goals(world, float(self.config.target_speed), self.state.speed)
         self.info_arrays |= {
             'landed': self.plan.landed,
             'landing_error': self.plan.landing_error,
             'heading_error': self.plan.heading_error,
-            'goals_reached': self.goals.reached,
-            'speed': self.state.speed,
             'duration': self.state.duration,
         }
-        self._goal_drawer.bind(world, self.goals, self.clock.steps, self._random)
-        balls = no_ball(n)
-        if self.ball:
-            self.ball.bind(world)
-            balls = self.ball.rules(float(self.config.target_speed), self.goal_reached, self.terms)
-            self.saved = (*self.saved, self.ball.state)
-            self.info_arrays['at_goal'] = self.ball.state.at_goal
-        blocks = self._controller_blocks
-        observation = np.zeros((n, sum(block.size for block in blocks)))
-        self.figure.bind(world, self.joint_map, observation, blocks, self.ABOUT)
-        observed = ControllerData(columns(blocks), observation)
-        self._controller_observation = observation
+        self._controller_observation = np.zeros((n, sum(block.size for block in blocks)))
         self._joint_action = np.zeros((n, len(self.joint_map)))
-        self._pack = packed(
-            PlanningData(
-                body=self.figure.data,
-                outcome=self.outcome,
-                clock=self.clock,
-                travel=self.travel,
-                period=self.period,
-                controller=observed,
-                plan=self.plan,
-                goals=self.goals,
-                state=self.state,
-                trace=self.trace,
-                columns=columns(self.observed),
-                terms=terms_data(NAVIGATION_TERMS),
-                by_plan=self.interface == 'plan',
-                plan_offset=self.action_map.action_offset,
-                plan_scale=self.action_map.action_scale,
-                target_speed=float(self.config.target_speed),
-                goal_reached=self.goal_reached,
-                with_ball=self.ball is not None,
-                ball=balls,
-            )
+        self.figure.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
+        return PlanningData(
+            body=self.figure.data,
+            outcome=self.outcome,
+            clock=self.clock,
+            travel=self.travel,
+            period=self.period,
+            controller=ControllerData(columns(blocks), self._controller_observation),
+            plan=self.plan,
+            aims=aims,
+            state=self.state,
+            columns=columns(self.observed),
+            terms=terms_data(NAVIGATION_TERMS),
+            by_plan=self.interface == 'plan',
+            plan_offset=self.action_map.action_offset,
+            plan_scale=self.action_map.action_scale,
         )
-
-    @property
-    def goal(self) -> np.ndarray:
-        """Goal of the walker, or of the ball, (n, 3) m."""
-        return self.goals.place
 
     # Episodes.
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = np.zeros((len(env_ids), 3))
-        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            ground = SpatialGround(
-                self.arena.terrain,
-                self.terrain_seed(i, random_state),
-                terrain_level=self.config.terrain_level,
-            )
+        for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            seed = self.terrain_seed(i, random_state)
             random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
             self.clock.start[i] = random.choice(self.config.start_phases)
-            spawns[k] = ground.spawn(random)
-            self.arena.begin_episode(i, ground, spawns[k, :2])
-        self.travel.origin[env_ids] = spawns
+            self._begin_ground(i, seed, random)
         self._begin_clocks(env_ids)
         self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
-        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+        poses, rates = pose_of_step(self.steps, self._first, self.phase[env_ids])
+        return poses, rates, self.travel.origin[env_ids]
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         plan, state = self.plan, self.state
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = state.down[env_ids] = 0.0
         plan.landed[env_ids] = False
-        state.lasted[env_ids] = self.goals.reached[env_ids] = 0
+        state.lasted[env_ids] = 0
         state.speed[env_ids] = state.duration[env_ids] = 0.0
-        self.trace.places[env_ids] = np.nan
+        self._begin_goals(env_ids)
         measurement = self.figure.measure(env_ids)
-        for i in env_ids.tolist():
-            self.begin_goal(i)
-        if self.ball:
-            self.ball.state.at_goal[env_ids] = False
-            self.world.forward(env_ids)
         # Before the first action, the plan is the current positions of the feet.
         plan.heading[env_ids] = measurement.heading[env_ids]
         stance = plan.stance[env_ids]
         plan.landing[env_ids, 0] = measurement.feet[env_ids, 1 - stance]
         plan.landing[env_ids, 1] = measurement.feet[env_ids, stance]
-
-    def begin_goal(self, i: int) -> None:
-        """Draws the first goal of an episode, and places the ball, from the last measurement."""
-        self._goal_drawer.begin(i, self.figure.measurement.root[i, :2])
 
     @property
     def steps_per_call(self) -> int:
@@ -374,7 +314,7 @@ class HierarchicalNavigation(Planned, ClockedTask):
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])
         if score_all(env_ids, self._pack):
-            self._goal_drawer.redraw(env_ids, self.figure.measurement.root[:, :2])
+            self._redraw_goals(env_ids)
         finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
@@ -382,10 +322,5 @@ class HierarchicalNavigation(Planned, ClockedTask):
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the plan, past positions of the centre of mass, and the goal."""
-        root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
-        there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
-        return [
-            *plan_markers(env_id, root, self.plan),
-            *trace_markers(env_id, self.trace),
-            there,
-        ]
+        root = self.world.xpos[env_id, self.figure.links[0]]
+        return [*plan_markers(env_id, root, self.plan), *super().markers(env_id)]

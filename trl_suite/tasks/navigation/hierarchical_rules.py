@@ -18,9 +18,15 @@ from trl_suite.bodies.spatial import (
     observe_body,
 )
 from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE
-from trl_suite.tasks.common.ball import BallData, dribble, observe_ball, remember
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
-from trl_suite.tasks.common.goals import Goals, Trace, follow, observe_place
+from trl_suite.tasks.common.goals import (
+    GoalData,
+    dribble,
+    follow,
+    observe_goal,
+    remember,
+    test_goal,
+)
 from trl_suite.tasks.rewards import FALL_THRESHOLD, Outcome, Term, conclude, give, sample_fall
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
@@ -92,8 +98,6 @@ class PlanningData(NamedTuple):
       terms: the reward terms of a goal.
       by_plan: whether a step is a footstep, not a control step.
       plan_offset, plan_scale: offset and scale of actions.
-      target_speed, goal_reached: see `HierarchicalConfig`, m/s and m.
-      with_ball: whether the goal is that of a ball.
     """
 
     body: SpatialBodyData
@@ -103,18 +107,13 @@ class PlanningData(NamedTuple):
     period: float
     controller: ControllerData
     plan: FootstepPlan
-    goals: Goals
+    aims: GoalData
     state: PlanningState
-    trace: Trace
     columns: Any
     terms: Any
     by_plan: bool
     plan_offset: np.ndarray
     plan_scale: np.ndarray
-    target_speed: float
-    goal_reached: float
-    with_ball: bool
-    ball: BallData
 
 
 # A step of simulation i: `begin_step`; then for every control step the action of the footstep
@@ -131,8 +130,7 @@ def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
     state.lasted[i] = 0
     for k in range(3):
         state.begin[i, k] = body.measurement.com[i, k]
-    if data.with_ball:
-        remember(i, body.physics, body.measurement, data.ball)
+    remember(i, body.physics, body.measurement, data.aims)
     data.plan.landed[i] = False
     observe_for_controller(i, data)
 
@@ -197,7 +195,7 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
-    follow(i, count, measurement.com, data.trace)
+    follow(i, count, measurement.com, data.aims.trace)
     state.over[i] = (
         plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST or not data.by_plan
     )
@@ -209,42 +207,28 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
 @compiled
 def score(i: int, data: PlanningData) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
-    body, goals, state, ball = data.body, data.goals, data.state, data.ball.state
-    measurement, outcome = body.measurement, data.outcome
+    body, aims, state, outcome = data.body, data.aims, data.state, data.outcome
+    measurement, place = body.measurement, data.aims.goals.place
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
-    goals.wanted[i] = ball.wanted[i] = False
+    aims.goals.wanted[i] = aims.ball.wanted[i] = False
     if outcome.diverged[i]:
         return False
-    if data.with_ball:
-        balls, place = data.ball, goals.place
-        state.speed[i] = dribble(i, seconds, place, body.physics, measurement, balls, outcome)
+    if aims.with_ball:
+        state.speed[i] = dribble(i, seconds, body.physics, measurement, aims, outcome)
     else:
-        x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
+        x, y = place[i, 0] - state.begin[i, 0], place[i, 1] - state.begin[i, 1]
         distance = math.hypot(x, y)
         moved_x = measurement.com[i, 0] - state.begin[i, 0]
         moved_y = measurement.com[i, 1] - state.begin[i, 1]
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
-        lack = min(speed - data.target_speed, 0.0)
-        full = distance < data.goal_reached
+        lack = min(speed - aims.target_speed, 0.0)
+        full = distance < aims.near
         worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
         give(i, worth, data.terms.speed, outcome)
         give(i, 1.0, data.terms.upright, outcome)
         state.speed[i] = speed
-    if outcome.failed[i]:
-        return False
-    count = data.clock.steps[i]
-    late = count >= goals.due[i]
-    if data.with_ball:  # a ball's goal is not redrawn when it is reached
-        goals.reached[i] += ball.at_goal[i]
-        ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
-    else:
-        x = goals.place[i, 0] - measurement.root[i, 0]
-        y = goals.place[i, 1] - measurement.root[i, 1]
-        reached = math.hypot(x, y) < data.goal_reached
-        goals.reached[i] += reached
-        goals.wanted[i] = reached or late
-    return goals.wanted[i] or ball.wanted[i]
+    return not outcome.failed[i] and test_goal(i, data.clock.steps[i], measurement, aims)
 
 
 @compiled
@@ -260,17 +244,13 @@ def finish(i: int, data: PlanningData) -> None:
 def observe(i: int, data: PlanningData) -> None:
     """Writes the observation."""
     body, measurement, columns = data.body, data.body.measurement, data.columns
-    observation, place = data.outcome.observation, data.goals.place
+    observation = data.outcome.observation
     observe_body(i, columns, body, observation)
     if columns.surface >= 0:
         block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
         x, y = measurement.root[i, 0], measurement.root[i, 1]
         spatial_ground.velocity_map(i, x, y, measurement.heading[i], body.ground, block)
-    if data.with_ball:
-        observe_ball(i, columns, place, body.physics, measurement, data.ball, observation)
-    else:
-        x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
-        observe_place(i, columns.goal, x, y, measurement, observation)
+    observe_goal(i, columns, body.physics, measurement, data.aims, observation)
     if columns.low_level >= 0:
         observe_for_controller(i, data)
         for k in range(data.controller.observation.shape[1]):

@@ -10,40 +10,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block, Noise, columns
-from trl_suite.bodies.body import Measurement
-from trl_suite.bodies.reference import CONTROL_TIMESTEP, link_extents
-from trl_suite.bodies.state import POINT, REAL, allocated
+from trl_suite.bodies.body import Measurement, Travel, go
+from trl_suite.bodies.reference import link_extents
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.common.control import HEIGHT_MAP, check_position_options, maps, planar_heights
+from trl_suite.tasks.common.control import (
+    GroundConfig,
+    height_map,
+    joint_angle,
+    physics_steps,
+    planar_heights,
+)
 from trl_suite.tasks.rewards import Outcome, conclude
-from trl_suite.tasks.task import MOST_SUBSTEPS, SUBSTEPS, TERRAIN_LEVEL, Task
-from trl_suite.tasks.tracking import make_body
-from trl_suite.terrain import PlanarGround, SpatialGround
-from trl_suite.util.compiled import compiled, packed
-from trl_suite.util.options import Config, option
+from trl_suite.tasks.tracking import BodyTask
+from trl_suite.util.compiled import compiled
 
 FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
 GRAVITY = 9.8  # m/s^2
-
-
-class WalkState(NamedTuple):
-    """State of each walker.
-
-    Attributes:
-      origin: x, y of the start, (n, 2) m.
-      target_heading: direction to walk in, rad to the left of +x, (n,).
-      distance: distance travelled along the target heading, (n,) m.
-    """
-
-    origin: np.ndarray = POINT
-    target_heading: np.ndarray = REAL
-    distance: np.ndarray = REAL
 
 
 class WalkData(NamedTuple):
@@ -58,22 +45,18 @@ class WalkData(NamedTuple):
     measurement: Measurement
     diverged: np.ndarray
     columns: Any
-    state: WalkState
+    travel: Travel
     outcome: Outcome
 
 
 @compiled
 def observe(i: int, data: WalkData) -> None:
     """Writes the distance, and the block `TARGET_HEADING`."""
-    state, columns, measurement = data.state, data.columns, data.measurement
-    if columns.target_heading >= 0:
-        bearing = state.target_heading[i] - measurement.heading[i]
-        data.outcome.observation[i, columns.target_heading] = math.cos(bearing)
-        data.outcome.observation[i, columns.target_heading + 1] = math.sin(bearing)
-    x, y = measurement.root[i, 0] - state.origin[i, 0], measurement.root[i, 1] - state.origin[i, 1]
-    state.distance[i] = (
-        math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
-    )
+    go(i, True, data.measurement, data.travel)
+    if data.columns.target_heading >= 0:
+        bearing = data.travel.origin[i, 2] - data.measurement.heading[i]
+        data.outcome.observation[i, data.columns.target_heading] = math.cos(bearing)
+        data.outcome.observation[i, data.columns.target_heading + 1] = math.sin(bearing)
 
 
 TARGET_HEADING = Block(
@@ -86,33 +69,29 @@ TARGET_HEADING = Block(
 
 
 @compiled
-def finish_all(env_ids: np.ndarray, stepped: bool, data: WalkData) -> None:
-    """Finishes steps, or only observes, after bodies were measured; takes a pack."""
+def finish_all(env_ids: np.ndarray, data: WalkData) -> None:
+    """Finishes steps, after bodies were measured; takes a pack."""
     for i in env_ids:
-        outcome = data.outcome
-        if stepped:
-            outcome.diverged[i] = data.diverged[i]
-            conclude(i, data.diverged[i] or data.measurement.fallen[i], outcome)
-            if data.diverged[i]:  # keeps the last finite observation
-                continue
+        diverged, outcome = data.diverged[i], data.outcome
+        outcome.diverged[i] = diverged
+        conclude(i, diverged or data.measurement.fallen[i], outcome)
+        if not diverged:  # otherwise keeps the last finite observation
+            observe(i, data)
+
+
+@compiled
+def observe_all(env_ids: np.ndarray, data: WalkData) -> None:
+    """Writes distances and observations; takes a pack."""
+    for i in env_ids:
         observe(i, data)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class WalkConfig(Config):
+class WalkConfig(GroundConfig):
     """Options of `Walk`."""
 
-    substeps: int = option(
-        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
-    )
-    action_scale: float | None = option(
-        None,
-        'joint angle per unit action, from the working posture; by default 1.5',
-        unit='rad',
-        above=0,
-        actuation='position',
-    )
-    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+    substeps: int = physics_steps(4)
+    action_scale: float | None = joint_angle(', from the working posture; by default 1.5')
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -126,14 +105,10 @@ class PlanarWalkConfig(WalkConfig):
 class SpatialWalkConfig(WalkConfig):
     """Options of a walk in three dimensions."""
 
-    terrain_observation: str | Collection[str] = option((), HEIGHT_MAP, choices=('height',))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set('terrain_observation', maps(self.terrain_observation))
+    terrain_observation: str | Collection[str] = height_map()
 
 
-class Walk(Task):
+class Walk(BodyTask):
     """A planar or spatial character walks on random terrain, from its working posture.
 
     An episode fails when a fall link touches the ground. The task has no reward: `suite.build` adds
@@ -145,6 +120,8 @@ class Walk(Task):
     """
 
     CONFIG: Any = MappingProxyType({False: PlanarWalkConfig, True: SpatialWalkConfig})
+    finish_all, observe_all = finish_all, observe_all
+    strain = False
 
     def __init__(
         self,
@@ -165,50 +142,33 @@ class Walk(Task):
         Raises:
           ValueError: incompatible options.
         """
-        self._spatial = character.spec.spatial
-        if config is None:
-            config = SpatialWalkConfig() if self._spatial else PlanarWalkConfig()
-        self.character, self.arena, self.config = character, arena, config
-        self.actuation_model = actuation_model
-        self.figure: Any = make_body(character, arena, config.terrain_observation)
-        self.fields = self.figure.fields
-        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
-        check_position_options(actuation_model, 'clip', config.action_scale)
-        scale = config.action_scale
-        options = {} if scale is None else {'action_scale': scale}
-        self.action_map = actuation.add(
-            character, actuation_model, self.physics_timestep, **options
+        config = self.CONFIG[character.spec.spatial]() if config is None else config
+        observed = config.terrain_observation
+        super().__init__(
+            character, arena, None, config, actuation_model, terrain_observation=observed
         )
+        self.action_map = self.joint_map
         self.observed = *self.figure.blocks, TARGET_HEADING.observed_if(self._spatial)
 
-    @property
-    def root_entity(self) -> PlanarArena | SpatialArena:
-        return self.arena
-
-    def bind(self, world: World) -> None:
-        self.world, n = world, world.n
-        self.state = allocated(WalkState, n)
-        self._allocate(n, self.state.distance)
-        self.saved = (self.state, self.outcome)
+    def _bind(self, world: World) -> WalkData:
         figure = self.figure
         figure.bind(world, self.action_map, self.outcome.observation, self.observed)
         self._pose, self._extents = self._posture(world)
         # Height of the root above the ground in the working posture, m.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
-        data = WalkData(
+        return WalkData(
             measurement=figure.measurement,
             diverged=figure.data.diverged,
             columns=columns(self.observed),
-            state=self.state,
+            travel=self.travel,
             outcome=self.outcome,
         )
-        self._pack = packed(data)
 
     @property
     def target_heading(self) -> np.ndarray:
         """Target heading of each walker, rad to the left of +x, (n,)."""
-        return self.state.target_heading
+        return self.travel.origin[:, 2]
 
     def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
         """Returns the initial pose, with the root at the origin, and the extents of its geoms."""
@@ -222,42 +182,18 @@ class Walk(Task):
                 values.append(float(np.ravel(joint.target)[0]))
         pose = np.array(values)
         data = world.posed(figure.pose_qpos, pose)
-        geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
-        return pose, link_extents(world.models[0], data, geoms, np.zeros(2))
+        return pose, link_extents(world.models[0], data, figure.geoms, np.zeros(2))
 
-    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        terrain, count = self.arena.terrain, len(env_ids)
-        poses = np.tile(self._pose, (count, 1))
-        rates = np.zeros((count, len(self.figure.pose_dof)))
-        self.world.reset(env_ids)
-        spawns = np.zeros((count, 3))
-        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            seed = self.terrain_seed(i, random_state)
-            level = self.config.terrain_level
-            if isinstance(self.arena, SpatialArena):
-                ground = SpatialGround(terrain, seed, terrain_level=level)
-                spawns[k] = ground.spawn(random_state)
-                self.arena.begin_episode(i, ground, spawns[k, :2])
-            else:
-                self.arena.begin_episode(i, PlanarGround(terrain, seed, terrain_level=level))
-        where = spawns if self._spatial else np.tile(self._extents, (count, 1, 1))
-        self.figure.place(env_ids, poses, rates, where)
-        self.state.origin[env_ids], self.target_heading[env_ids] = spawns[:, :2], spawns[:, 2]
-        for array in self.outcome[1:]:  # all but the observation
-            array[env_ids] = 0
-        self.observe(env_ids)
-
-    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        self.figure.control(env_ids, action)
-
-    def finish_step(self, env_ids: np.ndarray) -> None:
-        self.figure.measure(env_ids, stepped=True)
-        finish_all(env_ids, True, self._pack)
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        env_ids = self.world.all_ids if env_ids is None else env_ids
-        self.figure.measure(env_ids)
-        finish_all(env_ids, False, self._pack)
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            self._begin_ground(i, self.terrain_seed(i, random_state), random_state)
+        poses = np.tile(self._pose, (len(env_ids), 1))
+        rates = np.zeros((len(env_ids), len(self.figure.pose_dof)))
+        if self._spatial:
+            return poses, rates, self.travel.origin[env_ids]
+        return poses, rates, np.tile(self._extents, (len(env_ids), 1, 1))
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the components of horizontal vectors (n, 2) along the target heading, (n,)."""
