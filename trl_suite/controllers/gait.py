@@ -1,33 +1,27 @@
-"""Gaits of planar characters, for use in any world.
+"""The gait of a planar character: its parameters, bound to the simulations of a world.
 
     gait = Gait(character, ground_body, root)  # before the model is compiled
     gait.bind(world)
-    gait.begin(env_ids)                        # after a reset
-    gait.apply(env_ids, vectors)               # the parameters of the next cycle
-    while ...:
-        world.ctrl[...] = gait.torques(env_ids)
-        world.step(...)                        # CONTROL_TIMESTEP
-        ended = gait.advance(env_ids)          # whether cycles are over: then apply the next ones
 
-A compiled loop calls the functions of `trl_suite.controllers.gaits` with `gait.rules` instead.
+Compiled functions then call those of `trl_suite.controllers.gaits` with `gait.rules`: `begin` after a reset,
+`apply` with the parameters of a cycle; in every control step `act`, physics, and `advance`, which returns
+whether the cycle has ended.
 """
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
 
 from trl_suite.bodies.planar import PlanarState
 from trl_suite.characters import Character
-from trl_suite.controllers import dynamics, gaits, parameters
+from trl_suite.controllers import dynamics, parameters
 from trl_suite.controllers.dynamics import Mechanics
-from trl_suite.controllers.machine import STATES, GaitRules, GaitState, Machine, Scratch
+from trl_suite.controllers.gaits import STATES, GaitRules, GaitState, Machine, Scratch
 from trl_suite.controllers.parameters import KINDS, Parameters
 from trl_suite.engine import World
 from trl_suite.util import errors
-from trl_suite.util.compiled import packed
 
 _LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift supports, in addition to the root
 
@@ -123,10 +117,6 @@ class Gait:
         mechanics = Mechanics(*(getattr(world, name) for name in Mechanics._fields))
         self.rules = GaitRules(skeleton, physics, mechanics, machine, self.state, scratch)
 
-    @functools.cached_property
-    def _pack(self) -> Any:
-        return packed(self.rules)
-
     def _places(self, legs: np.ndarray) -> np.ndarray:
         """Returns `Machine.place`, the parameter of a state for the target of each joint."""
         gait = self.parameters
@@ -160,30 +150,3 @@ class Gait:
             f'{leg} leaves the ground',
             f'root starts to fall; if {leg} touches the ground first, the next state is UpStance',
         )
-
-    def begin(self, env_ids: np.ndarray) -> None:
-        """Resets state machines to the start of their first cycle, with the default parameters."""
-        gaits.begin_all(self.world.all_ids[env_ids], self.parameters.action_offset, self._pack)
-
-    def apply(self, env_ids: np.ndarray, vectors: np.ndarray) -> None:
-        """Begins cycles with parameters (m, P)."""
-        env_ids, vectors = self.world.all_ids[env_ids], np.ascontiguousarray(vectors, float)
-        expected = len(env_ids), len(self.parameters.names)
-        if vectors.shape != expected:
-            raise ValueError(f'vectors have shape {vectors.shape}; expected {expected}')
-        gaits.apply_all(env_ids, vectors, self._pack)
-
-    def torques(self, env_ids: np.ndarray) -> np.ndarray:
-        """Returns the torques of the next control step, within limits, (m, J) N m."""
-        gaits.act_all(self.world.all_ids[env_ids], self._pack)
-        return self.rules.scratch.torque[env_ids]
-
-    def advance(self, env_ids: np.ndarray) -> np.ndarray:
-        """Advances machines after a control step; returns whether cycles have ended, (m,) bool.
-
-        A machine whose cycle has ended stays in its last state until `apply`.
-        """
-        env_ids = self.world.all_ids[env_ids]
-        ended = np.empty(len(env_ids), bool)
-        gaits.advance_all(env_ids, self._pack, ended)
-        return ended

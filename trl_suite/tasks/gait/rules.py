@@ -19,7 +19,7 @@ from trl_suite.bodies.planar import (
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import CONTROL_TIMESTEP, gaits
-from trl_suite.controllers.machine import GaitRules, touches
+from trl_suite.controllers.gaits import GaitRules, touches
 from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
 from trl_suite.tasks.rewards import (
@@ -96,10 +96,13 @@ class GaitTaskState(NamedTuple):
     stumbling: np.ndarray = REAL
 
 
-class Options(NamedTuple):
-    """Constants of a gait task.
+class GaitData(NamedTuple):
+    """Data for the compiled functions of gait tasks.
 
     Attributes:
+      body: the body, which writes its blocks to `body.observation`, (n, ...).
+      terms: the reward terms.
+      interruption: why `go_on` returned last, (n,).
       by_cycle: whether a step is a cycle, not a frame of 1/30 s.
       substeps: physics steps per control step.
       action_offset: parameters of the gait at action 0, (P,).
@@ -114,6 +117,12 @@ class Options(NamedTuple):
       pitch, pitch_rate: columns of the observation for pitch and its rate; -1: not observed.
     """
 
+    body: PlanarBodyData
+    gait: GaitRules
+    terms: Any
+    interruption: np.ndarray
+    state: GaitTaskState
+    outcome: Outcome
     by_cycle: bool
     substeps: int
     action_offset: np.ndarray
@@ -130,74 +139,43 @@ class Options(NamedTuple):
     pitch_rate: int
 
 
-class GaitData(NamedTuple):
-    """Data for the compiled functions of gait tasks.
-
-    Attributes:
-      body: the body, which writes its blocks to `body.observation`, (n, ...).
-      terms: the reward terms.
-      interruption: why `go_on` returned last, (n,).
-    """
-
-    body: PlanarBodyData
-    gait: GaitRules
-    options: Options
-    terms: Any
-    interruption: np.ndarray
-    state: GaitTaskState
-    outcome: Outcome
-
-
-# A step of simulation i, in order.
-
-
-@compiled
-def begin_step(i: int, action: np.ndarray, data: GaitData) -> None:
-    """Begins a step; the action sets the gait of a cycle that begins with it."""
-    state = data.state
-    for k in range(state.action.shape[1]):
-        state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
-    state.lasted[i] = state.stumbled[i] = 0
-    state.going[i] = True
-    state.start[i] = data.body.physics.subtree_com[i, data.body.ids.links[0], 0]
-    if data.options.by_cycle or state.waiting[i]:
-        set_gait(i, data)
+# A step of simulation i.
 
 
 @compiled
 def set_gait(i: int, data: GaitData) -> None:
     """Begins a cycle with the parameters of the current action."""
-    options, action, vector = data.options, data.state.action, data.gait.state.vector
+    action, vector = data.state.action, data.gait.state.vector
     data.state.waiting[i] = False
-    if options.by_cycle:
-        for k in range(len(options.action_offset)):
-            vector[i, k] = options.action_offset[k]
-        for k in range(len(options.places)):
-            vector[i, options.places[k]] += options.action_scale[k] * action[i, k]
+    if data.by_cycle:
+        for k in range(len(data.action_offset)):
+            vector[i, k] = data.action_offset[k]
+        for k in range(len(data.places)):
+            vector[i, data.places[k]] += data.action_scale[k] * action[i, k]
     else:
         choice = 0
-        for k in range(1, len(options.base_actions)):
+        for k in range(1, len(data.base_actions)):
             if action[i, k] > action[i, choice]:
                 choice = k
-        for k in range(len(options.action_offset)):
-            vector[i, k] = options.base_actions[choice, k]
+        for k in range(len(data.action_offset)):
+            vector[i, k] = data.base_actions[choice, k]
     gaits.apply(i, data.gait)
 
 
 @compiled
 def go_on(i: int, watched: bool, data: GaitData) -> int:
     """Continues a step until it is over or interrupted; returns the reason."""
-    state, options = data.state, data.options
+    state = data.state
     while state.going[i]:
         if state.lasted[i] % _FRAME_STEPS == 0 and has_left(i, data.body):
             return _GROUND
         gaits.act(i, data.gait)
         for k in range(data.gait.scratch.torque.shape[1]):
             data.body.ctrl[i, data.body.drive.first + k] = data.gait.scratch.torque[i, k]
-        native.step(i, options.substeps, data.body.engine)
+        native.step(i, data.substeps, data.body.engine)
         ended = gaits.advance(i, data.gait)
         account(i, data)
-        if options.by_cycle:
+        if data.by_cycle:
             over = ended or state.lasted[i] == LONGEST_CYCLE * _FRAME_STEPS
         else:
             over = state.lasted[i] == _FRAME_STEPS
@@ -215,7 +193,7 @@ def account(i: int, data: GaitData) -> None:
     state = data.state
     state.lasted[i] += 1
     state.age[i] += 1
-    state.stumbled[i] += any_touches(i, data.options.stumble, data.gait)
+    state.stumbled[i] += any_touches(i, data.stumble, data.gait)
     if state.age[i] % _SAMPLE_STEPS == 0:
         judge(i, data)
 
@@ -233,10 +211,10 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 def judge(i: int, data: GaitData) -> None:
     """Tests whether the episode has failed."""
     state, ids, physics = data.state, data.body.ids, data.body.physics
-    sample_fall(i, any_touches(i, data.options.fall, data.gait), state.down)
+    sample_fall(i, any_touches(i, data.fall, data.gait), state.down)
     pitch = physics.qpos[i, ids.qpos[2]]
     turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
-    backwards = data.options.forward_only and physics.qvel[i, ids.dof[0]] < 0.0
+    backwards = data.forward_only and physics.qvel[i, ids.dof[0]] < 0.0
     state.fell[i] = state.down[i] > FALL_THRESHOLD or turn > TURNED or backwards
     if state.age[i] % _PATIENCE_STEPS == 0:
         x, z = physics.qpos[i, ids.qpos[0]], physics.qpos[i, ids.qpos[1]]
@@ -249,30 +227,14 @@ def judge(i: int, data: GaitData) -> None:
 
 
 @compiled
-def finish_step(i: int, data: GaitData) -> None:
-    """Computes reward, failure and observation of a step that is over."""
-    state, outcome = data.state, data.outcome
-    state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
-    state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
-    outcome.diverged[i] |= breaks_down(i, math.inf, data.body)
-    failed = outcome.failed[i] or outcome.diverged[i]
-    if outcome.diverged[i]:
-        state.fell[i] = state.stuck[i] = False
-    else:
-        reward(i, data)
-        observe(i, data)
-    conclude(i, failed, outcome)
-
-
-@compiled
 def reward(i: int, data: GaitData) -> None:
     """Writes the reward terms, from mean speed and stumbling time of the cycle."""
-    state, options, terms, outcome = data.state, data.options, data.terms, data.outcome
+    state, terms, outcome = data.state, data.terms, data.outcome
     travelled = data.body.physics.subtree_com[i, data.body.ids.links[0], 0] - state.start[i]
     speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
-    off = speed - options.target_speed
+    off = speed - data.target_speed
     share = state.stumbled[i] / state.lasted[i]
-    if speed < 0.0 and not options.backward_reward:
+    if speed < 0.0 and not data.backward_reward:
         give(i, 0.0, terms.speed, outcome)
         give(i, 0.0, terms.stumble, outcome)
         return
@@ -284,16 +246,16 @@ def reward(i: int, data: GaitData) -> None:
 @compiled
 def observe(i: int, data: GaitData) -> None:
     """Writes the observation, with the stance leg first."""
-    options, ids, physics = data.options, data.body.ids, data.body.physics
+    ids, physics = data.body.ids, data.body.physics
     measured, observation = data.body.observation, data.outcome.observation
     measure(i, data.body)
     observe_body(i, data.body.columns, data.body, measured)
     stance = data.gait.state.stance[i]
-    for k in range(options.columns.shape[1]):
-        observation[i, k] = measured[i, options.columns[stance, k]]
-    if options.pitch >= 0:
-        observation[i, options.pitch] = physics.qpos[i, ids.qpos[2]]
-        observation[i, options.pitch_rate] = physics.qvel[i, ids.dof[2]]
+    for k in range(data.columns.shape[1]):
+        observation[i, k] = measured[i, data.columns[stance, k]]
+    if data.pitch >= 0:
+        observation[i, data.pitch] = physics.qpos[i, ids.qpos[2]]
+        observation[i, data.pitch_rate] = physics.qvel[i, ids.dof[2]]
 
 
 def observed_blocks(
@@ -320,7 +282,7 @@ def observed_blocks(
 def begin_episode(i: int, data: GaitData) -> None:
     """Resets state machine, outcome and state of the task."""
     state, ids, physics = data.state, data.body.ids, data.body.physics
-    gaits.begin(i, data.options.action_offset, data.gait)
+    gaits.begin(i, data.action_offset, data.gait)
     begin(i, data.outcome)
     state.going[i], state.waiting[i] = False, True
     state.lasted[i] = state.stumbled[i] = state.age[i] = 0
@@ -335,9 +297,16 @@ def begin_episode(i: int, data: GaitData) -> None:
 
 @compiled
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitData) -> None:
-    """Begins steps."""
+    """Begins steps; an action sets the gait of a cycle that begins with its step."""
+    state, root = data.state, data.body.ids.links[0]
     for i in env_ids:
-        begin_step(i, action, data)
+        for k in range(state.action.shape[1]):
+            state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+        state.lasted[i] = state.stumbled[i] = 0
+        state.going[i] = True
+        state.start[i] = data.body.physics.subtree_com[i, root, 0]
+        if data.by_cycle or state.waiting[i]:
+            set_gait(i, data)
 
 
 @compiled
@@ -352,9 +321,19 @@ def run(env_ids: np.ndarray, watched: bool, data: GaitData) -> int:
 
 @compiled
 def finish_steps(env_ids: np.ndarray, data: GaitData) -> None:
-    """Finishes steps."""
+    """Computes reward, failure and observation of steps that are over."""
+    state, outcome = data.state, data.outcome
     for i in env_ids:
-        finish_step(i, data)
+        state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
+        state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
+        outcome.diverged[i] |= breaks_down(i, math.inf, data.body)
+        failed = outcome.failed[i] or outcome.diverged[i]
+        if outcome.diverged[i]:
+            state.fell[i] = state.stuck[i] = False
+        else:
+            reward(i, data)
+            observe(i, data)
+        conclude(i, failed, outcome)
 
 
 @compiled

@@ -37,7 +37,6 @@ from trl_suite.tasks.gait.rules import (
     UPSTREAM_CENTRE,
     GaitData,
     GaitTaskState,
-    Options,
     begin_steps,
     finish_steps,
     observe_all,
@@ -169,31 +168,23 @@ class GaitTask(Task):
             'duration': self.state.duration,
             'stumbled': self.state.stumbling,
         }
+        parameters, spec = gait.parameters, self.character.spec
+        stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
+        pitch = parameters.observe_pitch
         self.data = GaitData(
             body=figure.data,
             gait=gait.rules,
-            options=self._options(),
             terms=terms_data(self.terms),
             interruption=np.zeros(n, int),
             state=self.state,
             outcome=self.outcome,
-        )
-        self._pack = packed(self.data)
-        self._start = self._start_pose()
-
-    def _options(self) -> Options:
-        parameters, spec = self.gait.parameters, self.character.spec
-        fall = [self.gait.link[name] for name in spec.fall_links]
-        stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
-        pitch = parameters.observe_pitch
-        return Options(
             by_cycle=self.interface == 'parameters',
             substeps=self._control_substeps,
             action_offset=parameters.action_offset.copy(),
             action_scale=parameters.action_scale[parameters.actions],
             places=parameters.actions,
             base_actions=parameters.base_actions,
-            fall=np.array(fall),
+            fall=np.array([gait.link[name] for name in spec.fall_links]),
             stumble=np.array(stumble),
             forward_only=parameters.forward_only,
             backward_reward=parameters.backward_reward,
@@ -202,6 +193,8 @@ class GaitTask(Task):
             pitch=self.blocks['pose'].stop - 1 if pitch else -1,
             pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
         )
+        self._pack = packed(self.data)
+        self._start = self._start_pose()
 
     def _columns(self) -> np.ndarray:
         """Returns the columns of the body's blocks in an observation, by stance leg, (2, size)."""
