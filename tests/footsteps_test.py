@@ -283,7 +283,7 @@ class PlanTest(parameterized.TestCase):
 
         def height(x, y):
             if is_planar(environment):
-                return task.figure.ground_heights(0, np.atleast_1d(x))
+                return task.arena.height(np.atleast_1d(x)[None], slice(0, 1))[0]
             return ground(environment, x, y)
 
         for _ in range(3):

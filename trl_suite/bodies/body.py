@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.actuation.action_map import ActionMap
+from trl_suite.actuation.action_map import ActionMap, Drive
 from trl_suite.bodies.blocks import Block, columns
 from trl_suite.bodies.state import FLAG, PLACE, REAL, allocated
 from trl_suite.characters import Character
@@ -132,6 +132,33 @@ def is_broken(i: int, limit: float, body: Any) -> bool:
     )
 
 
+class BodyData(NamedTuple):
+    """A body in all simulations, for compiled functions.
+
+    Attributes:
+      ids: its ids, `PlanarIds` or `SpatialIds`.
+      physics: `PlanarState` or `SpatialState`.
+      ground: windows of the ground.
+      ctrl: controls of the physics, (n, ...).
+      columns: first columns of its blocks in the observation; -1: not observed.
+      observation: to which its blocks are written, (n, ...).
+      leaving: whether the body has left its ground window, which must then be moved, (n,).
+      diverged: whether the physics has diverged, or the body has left its ground, (n,).
+    """
+
+    engine: native.Engine
+    ids: Any
+    physics: Any
+    ground: Any
+    drive: Drive
+    ctrl: np.ndarray
+    measurement: Measurement
+    columns: Any
+    observation: np.ndarray
+    leaving: np.ndarray
+    diverged: np.ndarray
+
+
 class Body(abc.ABC):
     """One body in every simulation of a world.
 
@@ -150,6 +177,7 @@ class Body(abc.ABC):
     fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
     control_all: Compiled
     measure_all: Compiled
+    physics: Any  # fields of MjData that are measured
     character: Character
     arena: Any
     blocks: tuple[Block, ...]
@@ -159,39 +187,40 @@ class Body(abc.ABC):
     pose_dof: np.ndarray
     _world: World
 
-    def _bind(self, world: World) -> None:
-        """Resolves ids that every body has."""
-        self._world = world
-        self.arena.bind(world)
-        character = self.character
-        self.links = world.body_ids([body.full_identifier for body in character.bodies])
-        self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
-        self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
-        mass = world.models[0].body_mass[self.links]
-        self._share = mass / mass.sum()
+    def _add_sensor(self, link: str, kind: str, **ground: Any) -> str:
+        """Adds a sensor of the contacts between a link and the ground; returns its name."""
+        model = self.character.mjcf_model
+        name, body = f'{model.model}_{link}_{kind}', model.find('body', link)
+        contact = {'body1': body, 'num': 1, 'data': 'found', **ground}
+        self.arena.mjcf_model.sensor.add('contact', name=name, **contact)
+        return name
 
-    def _use(
+    def bind(
         self,
-        kind: Any,
-        ids: Any,
-        physics: Any,
-        ground: Any,
+        world: World,
         action_map: ActionMap,
         observation: np.ndarray,
         observed: tuple[Block, ...],
+        about: str = 'com',
     ) -> None:
-        """Makes the data, and its pack.
+        """Resolves ids in a compiled world.
 
         Args:
-          kind: type of the data.
-          ids: ids of the body.
-          physics: type of the fields of the physics.
-          ground: the ground of all simulations, for compiled functions.
-          action_map, observation, observed: see `PlanarBody.bind`.
+          world: the simulations.
+          action_map: the map from actions to the actuators of the joints.
+          observation: array to which the body's blocks are written, (n, ...).
+          observed: the blocks of this array, of which some are the body's.
+          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
         """
-        world, scope = self._world, f'{self.character.mjcf_model.model}/'
+        self._world, character = world, self.character
+        self.arena.bind(world)
+        self.links = world.body_ids([body.full_identifier for body in character.bodies])
+        self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
+        self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
+        mass, scope = world.models[0].body_mass[self.links], f'{character.mjcf_model.model}/'
+        self._share = mass / mass.sum()
+        self.ids = self._resolve(about == 'com')
         first = world.control_addresses([scope + action_map.actuators[0]])[0]  # of consecutive ones
-        self.ids = ids
         sizes = {block.name: block.size for block in self.blocks}
         self.measurement = allocated(
             Measurement,
@@ -202,11 +231,11 @@ class Body(abc.ABC):
             velocity=np.zeros(sizes['velocity']),
             features=np.zeros(self.columns['height'].stop),
         )
-        self.data = kind(
+        self.data = BodyData(
             engine=world.engine,
-            ids=ids,
-            physics=physics(*(getattr(world, name) for name in physics._fields)),
-            ground=ground,
+            ids=self.ids,
+            physics=self.physics(*(getattr(world, name) for name in self.physics._fields)),
+            ground=self._ground(),
             drive=action_map.drive(int(first)),
             ctrl=world.ctrl,
             measurement=self.measurement,
@@ -216,6 +245,14 @@ class Body(abc.ABC):
             diverged=np.zeros(world.n, bool),
         )
         self.pack = packed(self.data)
+
+    @abc.abstractmethod
+    def _resolve(self, about_com: bool) -> Any:
+        """Returns the ids of the body; sets `pose_qpos`, `pose_dof` and `columns`."""
+
+    @abc.abstractmethod
+    def _ground(self) -> Any:
+        """Returns the ground of all simulations, for compiled functions."""
 
     def control(self, env_ids: np.ndarray, action: np.ndarray) -> None:
         """Writes the controls of some simulations; moves ground windows, so that images show them.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.actuation import hill
-from trl_suite.actuation.action_map import ActionMap, Drive, drive
+from trl_suite.actuation.action_map import drive
 from trl_suite.actuation.muscles import Muscle
 from trl_suite.arenas import PlanarArena
 from trl_suite.bodies.blocks import HEIGHTS, PLACES, SPEEDS, Block, Noise
@@ -16,12 +16,11 @@ from trl_suite.bodies.body import (
     CLEARANCE,
     MAX_JOINT_SPEED,
     Body,
-    Measurement,
+    BodyData,
     feature_columns,
     is_broken,
 )
 from trl_suite.characters import Character
-from trl_suite.engine import World, native
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
@@ -73,32 +72,8 @@ class PlanarState(NamedTuple):
     ten_length: np.ndarray
 
 
-class PlanarBodyData(NamedTuple):
-    """A body in all simulations, for compiled functions.
-
-    Attributes:
-      ctrl: controls of the physics, (n, ...).
-      columns: first columns of its blocks in the observation; -1: not observed.
-      observation: to which its blocks are written, (n, ...).
-      leaving: whether the body has left its ground window, which must then be moved, (n,).
-      diverged: whether the physics has diverged, or the body has left its ground, (n,).
-    """
-
-    engine: native.Engine
-    ids: PlanarIds
-    physics: PlanarState
-    ground: PlanarWindows
-    drive: Drive
-    ctrl: np.ndarray
-    measurement: Measurement
-    columns: Any
-    observation: np.ndarray
-    leaving: np.ndarray
-    diverged: np.ndarray
-
-
 @compiled
-def measure(i: int, body: PlanarBodyData) -> None:
+def measure(i: int, body: BodyData) -> None:
     """Measures a body; x of positions in `pose` and `velocity` is ahead of the trunk."""
     ids, state, ground, out = body.ids, body.physics, body.ground, body.measurement
     pitch = state.qpos[i, ids.qpos[2]]
@@ -148,7 +123,7 @@ def measure(i: int, body: PlanarBodyData) -> None:
 
 
 @compiled
-def observe_body(i: int, columns: Any, body: PlanarBodyData, observation: np.ndarray) -> None:
+def observe_body(i: int, columns: Any, body: BodyData, observation: np.ndarray) -> None:
     """Writes the blocks of a body, as `PlanarBody.blocks` describes them."""
     ids, out = body.ids, body.measurement
     x, facing = out.root[i, 0], out.cosine[i]
@@ -168,20 +143,20 @@ def observe_body(i: int, columns: Any, body: PlanarBodyData, observation: np.nda
 
 
 @compiled
-def breaks_down(i: int, limit: float, body: PlanarBodyData) -> bool:
+def breaks_down(i: int, limit: float, body: BodyData) -> bool:
     """Returns whether a simulation diverged (see `is_broken`) or a body left its ground."""
     x = body.physics.qpos[i, body.ids.qpos[0]]
     return is_broken(i, limit, body) or planar_ground.is_lost(i, x, body.ground)
 
 
 @compiled
-def has_left(i: int, body: PlanarBodyData) -> bool:
+def has_left(i: int, body: BodyData) -> bool:
     """Returns whether a body has left its ground window, which must be moved."""
     return planar_ground.has_left(i, body.physics.qpos[i, body.ids.qpos[0]], body.ground)
 
 
 @compiled
-def measure_all(env_ids: np.ndarray, stepped: bool, body: PlanarBodyData) -> None:
+def measure_all(env_ids: np.ndarray, stepped: bool, body: BodyData) -> None:
     """Measures and observes bodies; see `Body.measure`. Takes a pack."""
     for i in env_ids:
         if stepped:
@@ -193,7 +168,7 @@ def measure_all(env_ids: np.ndarray, stepped: bool, body: PlanarBodyData) -> Non
 
 
 @compiled
-def control_all(env_ids: np.ndarray, action: np.ndarray, body: PlanarBodyData) -> int:
+def control_all(env_ids: np.ndarray, action: np.ndarray, body: BodyData) -> int:
     """Writes controls; returns how many ground windows must be moved. Takes a pack."""
     leaving = 0
     for i in env_ids:
@@ -206,7 +181,7 @@ def control_all(env_ids: np.ndarray, action: np.ndarray, body: PlanarBodyData) -
 class PlanarBody(Body):
     """A planar character in every simulation of a world; see `Body`."""
 
-    control_all, measure_all = control_all, measure_all
+    control_all, measure_all, physics = control_all, measure_all, PlanarState
     arena: PlanarArena
 
     def __init__(
@@ -233,9 +208,10 @@ class PlanarBody(Body):
         self.character, self.arena, self._muscles = character, arena, muscles
         character.create_root_joints(arena.attach(character))
         self._samples = np.linspace(-behind, ahead, samples)
-        self._fall_sensors = [self._add_sensor(n, 'fall') for n in character.spec.fall_links]
-        ends = character.spec.end_effectors if contact else ()
-        self._contact_sensors = [self._add_sensor(name, 'contact') for name in ends]
+        spec, ground = character.spec, arena.ground_body
+        ends = spec.end_effectors if contact else ()
+        self._fall_sensors = [self._add_sensor(n, 'fall', body2=ground) for n in spec.fall_links]
+        self._contact_sensors = [self._add_sensor(name, 'contact', body2=ground) for name in ends]
         links = len(character.spec.links)
         self.blocks = (
             Block(
@@ -253,32 +229,8 @@ class PlanarBody(Body):
             ),
         )  # fmt: skip
 
-    def _add_sensor(self, link: str, kind: str) -> str:
-        """Adds a sensor of the contacts between a link and the ground; returns its name."""
-        name = f'{self.character.mjcf_model.model}_{link}_{kind}'
-        body = self.character.mjcf_model.find('body', link)
-        contact = {'body1': body, 'body2': self.arena.ground_body, 'num': 1, 'data': 'found'}
-        self.arena.mjcf_model.sensor.add('contact', name=name, **contact)
-        return name
-
-    def bind(
-        self,
-        world: World,
-        action_map: ActionMap,
-        observation: np.ndarray,
-        observed: tuple[Block, ...],
-        about: str = 'com',
-    ) -> None:
-        """Resolves ids in a compiled world.
-
-        Args:
-          world: the simulations.
-          action_map: the map from actions to the actuators of the joints.
-          observation: array to which the body's blocks are written, (n, ...).
-          observed: the blocks of this array, of which some are the body's.
-          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
-        """
-        self._bind(world)
+    def _resolve(self, about_com: bool) -> PlanarIds:
+        world = self._world
         character = self.character
         scope = f'{character.mjcf_model.model}/'
         names = [f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')]
@@ -286,22 +238,23 @@ class PlanarBody(Body):
         self.pose_qpos, self.pose_dof = world.joint_addresses(names)
         turning = self.pose_dof[2:].copy()
         self.columns = feature_columns(0, len(turning), len(turning), len(self.effectors))
-        ids = PlanarIds(
+        return PlanarIds(
             qpos=self.pose_qpos,
             dof=self.pose_dof,
             turning=turning,
             links=self.links,
             effectors=self.effectors,
             share=self._share,
-            about_com=about == 'com',
+            about_com=about_com,
             samples=self._samples,
             fall=world.sensor_addresses(self._fall_sensors).astype(int),
             contact=world.sensor_addresses(self._contact_sensors).astype(int),
             rest=np.array([hill.rest_length(muscle) for muscle in self._muscles]),
             scale=np.array([hill.optimal_length(muscle) for muscle in self._muscles]),
         )
-        ground, using = self.arena.ground, (action_map, observation, observed)
-        self._use(PlanarBodyData, ids, PlanarState, ground, *using)
+
+    def _ground(self) -> PlanarWindows:
+        return self.arena.ground
 
     def recentre(self, env_ids: np.ndarray) -> None:
         self.arena.recentre(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
@@ -333,10 +286,6 @@ class PlanarBody(Body):
         ground.start[:] = 0.0
         return ground
 
-    def ground_heights(self, env_id: int, x: np.ndarray) -> np.ndarray:
-        """Returns heights of the ground of one simulation at x (k,), m."""
-        return self.arena.height(x[None], slice(env_id, env_id + 1))[0]
-
 
 @compiled
 def put_down_all(
@@ -344,7 +293,7 @@ def put_down_all(
     poses: np.ndarray,
     rates: np.ndarray,
     extents: np.ndarray,
-    body: PlanarBodyData,
+    body: BodyData,
 ) -> None:
     """Writes poses and velocities of bodies placed at x = 0; see `PlanarBody.place`."""
     ids, physics, ground = body.ids, body.physics, body.ground

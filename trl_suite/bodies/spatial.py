@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.actuation.action_map import ActionMap, Drive, drive
+from trl_suite.actuation.action_map import drive
 from trl_suite.arenas import SpatialArena
 from trl_suite.bodies.blocks import (
     HEIGHTS,
@@ -24,12 +23,12 @@ from trl_suite.bodies.body import (
     CLEARANCE,
     MAX_JOINT_SPEED,
     Body,
-    Measurement,
+    BodyData,
     feature_columns,
     is_broken,
 )
 from trl_suite.characters import Character
-from trl_suite.engine import World, native
+from trl_suite.engine import native
 from trl_suite.motion import quaternion
 from trl_suite.policies.mirror import blocks as mirrored_blocks
 from trl_suite.policies.mirror import exchanged
@@ -53,11 +52,7 @@ class SpatialIds(NamedTuple):
         root, then joints.
       turning: addresses of the joints' rates.
       angles: addresses of the quaternions of ball joints, four each, then of the other joints.
-      links: body ids, the root body first, (L,).
-      effectors: body ids of the end effectors, (E,).
-      share: mass of each link over the total mass, (L,).
-      about_com: whether end effector positions are relative to the centre of mass, not to the root.
-      fall: addresses of the contact sensors of fall links.
+      links, effectors, share, about_com, fall: see `PlanarIds`.
       contact: addresses of the contact sensors of end effectors, (E, sensors per end effector).
       corners: corners of the boxes of all collision geoms.
     """
@@ -100,24 +95,8 @@ class SpatialState(NamedTuple):
     sensordata: np.ndarray
 
 
-class SpatialBodyData(NamedTuple):
-    """A body in all simulations, for compiled functions; see `PlanarBodyData`."""
-
-    engine: native.Engine
-    ids: SpatialIds
-    physics: SpatialState
-    ground: SpatialWindows
-    drive: Drive
-    ctrl: np.ndarray
-    measurement: Measurement
-    columns: Any
-    observation: np.ndarray
-    leaving: np.ndarray
-    diverged: np.ndarray
-
-
 @compiled
-def measure(i: int, body: SpatialBodyData) -> None:
+def measure(i: int, body: BodyData) -> None:
     """Measures a body, relative to the current ground."""
     ids, state, ground, out = body.ids, body.physics, body.ground, body.measurement
     spatial_ground.see_movers(i, state.qpos, ground)
@@ -217,7 +196,7 @@ def measure(i: int, body: SpatialBodyData) -> None:
 
 
 @compiled
-def observe_body(i: int, columns: Any, body: SpatialBodyData, observation: np.ndarray) -> None:
+def observe_body(i: int, columns: Any, body: BodyData, observation: np.ndarray) -> None:
     """Writes the blocks terrain, pose and velocity of a body; see `body_blocks`."""
     out = body.measurement
     if columns.terrain >= 0:
@@ -232,7 +211,7 @@ def observe_body(i: int, columns: Any, body: SpatialBodyData, observation: np.nd
 
 
 @compiled
-def breaks_down(i: int, limit: float, body: SpatialBodyData) -> bool:
+def breaks_down(i: int, limit: float, body: BodyData) -> bool:
     """Returns whether a simulation diverged (see `is_broken`) or a body left its ground."""
     root = body.physics.xpos[i, body.ids.links[0]]
     return is_broken(i, limit, body) or spatial_ground.is_lost(
@@ -241,7 +220,7 @@ def breaks_down(i: int, limit: float, body: SpatialBodyData) -> bool:
 
 
 @compiled
-def measure_all(env_ids: np.ndarray, stepped: bool, body: SpatialBodyData) -> None:
+def measure_all(env_ids: np.ndarray, stepped: bool, body: BodyData) -> None:
     """Measures and observes bodies; see `Body.measure`. Takes a pack."""
     for i in env_ids:
         if stepped:
@@ -253,7 +232,7 @@ def measure_all(env_ids: np.ndarray, stepped: bool, body: SpatialBodyData) -> No
 
 
 @compiled
-def control_all(env_ids: np.ndarray, action: np.ndarray, body: SpatialBodyData) -> int:
+def control_all(env_ids: np.ndarray, action: np.ndarray, body: BodyData) -> int:
     """Writes controls and drives moving boxes; returns how many ground windows must be moved.
 
     To move a window drives its boxes as well. Takes a pack.
@@ -274,7 +253,7 @@ class SpatialBody(Body):
     """A three-dimensional character in every simulation of a world; see `Body`."""
 
     fields = ('xquat',)
-    control_all, measure_all = control_all, measure_all
+    control_all, measure_all, physics = control_all, measure_all, SpatialState
     arena: SpatialArena
 
     def __init__(
@@ -290,35 +269,20 @@ class SpatialBody(Body):
         self.character, self.arena, self.terrain_observation = character, arena, terrain_observation
         (self._root,) = character.create_root_joints(arena.attach(character))
         self._sensors = {
-            kind: [self._add_sensors(name, kind) for name in names]
-            for kind, names in (
+            kind: [
+                self._add_sensor(link, f'{kind}_{i}', **ground)
+                for link in links
+                for i, ground in enumerate(arena.touched)
+            ]
+            for kind, links in (
                 ('fall', character.spec.fall_links),
                 ('contact', character.spec.end_effectors),
             )
         }
         self.blocks = body_blocks(character, terrain_observation)
 
-    def _add_sensors(self, link: str, kind: str) -> list[str]:
-        """Adds sensors of the contacts between a link and the ground; returns their names."""
-        names = []
-        for i, ground in enumerate(self.arena.touched):
-            names.append(f'{self.character.mjcf_model.model}_{link}_{kind}_{i}')
-            self.arena.mjcf_model.sensor.add(
-                'contact', name=names[-1], body1=self.character.mjcf_model.find('body', link),
-                num=1, data='found', **ground,
-            )  # fmt: skip
-        return names
-
-    def bind(
-        self,
-        world: World,
-        action_map: ActionMap,
-        observation: np.ndarray,
-        observed: tuple[Block, ...],
-        about: str = 'com',
-    ) -> None:
-        """Resolves ids in a compiled world; see `PlanarBody.bind`."""
-        self._bind(world)
+    def _resolve(self, about_com: bool) -> SpatialIds:
+        world = self._world
         character = self.character
         names = [self._root.full_identifier, *(j.full_identifier for j in character.joints)]
         qpos, dof = world.joint_addresses(names)
@@ -328,10 +292,11 @@ class SpatialBody(Body):
         self.pose_dof = _addresses(dof, [6, *rates])
         balls = _addresses(qpos[1:][ball], sizes[ball])
         fall, contact = (
-            world.sensor_addresses([*itertools.chain(*names)]).astype(int)
-            for names in self._sensors.values()
+            world.sensor_addresses(names).astype(int) for names in self._sensors.values()
         )
-        ids = SpatialIds(
+        hinges, turning = np.count_nonzero(~ball), self.pose_dof[3:].size
+        self.columns = feature_columns(4 + len(balls), int(hinges), turning, len(self.effectors))
+        return SpatialIds(
             qpos=self.pose_qpos,
             dof=self.pose_dof,
             turning=self.pose_dof[6:].copy(),
@@ -339,15 +304,14 @@ class SpatialBody(Body):
             links=self.links,
             effectors=self.effectors,
             share=self._share,
-            about_com=about == 'com',
+            about_com=about_com,
             fall=fall,
-            contact=contact.reshape(len(self._sensors['contact']), len(self.arena.touched)),
+            contact=contact.reshape(-1, len(self.arena.touched)),
             corners=self._corners(),
         )
-        hinges, turning = np.count_nonzero(~ball), 3 + len(ids.turning)
-        self.columns = feature_columns(4 + len(balls), int(hinges), turning, len(self.effectors))
-        ground, using = self.arena.surroundings.arrays, (action_map, observation, observed)
-        self._use(SpatialBodyData, ids, SpatialState, ground, *using)
+
+    def _ground(self) -> SpatialWindows:
+        return self.arena.surroundings.arrays
 
     def _corners(self) -> Corners:
         model = self._world.models[0]
@@ -423,64 +387,52 @@ def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
 
 
 @compiled
-def put_down(
-    i: int,
-    row: int,
-    poses: np.ndarray,
-    rates: np.ndarray,
-    spawns: np.ndarray,
-    body: SpatialBodyData,
-) -> None:
-    """Places a body, from row `row` of poses, rates and spawns; see `SpatialBody.place`."""
-    ids, physics, ground, corners = body.ids, body.physics, body.ground, body.ids.corners
-    for k in range(len(ids.qpos)):
-        physics.qpos[i, ids.qpos[k]] = poses[row, k]
-    for k in range(len(ids.dof)):
-        physics.qvel[i, ids.dof[k]] = rates[row, k]
-    angle = spawns[row, 2]
-    cosine, sine = math.cos(angle), math.sin(angle)
-    x, y = poses[row, 0], poses[row, 1]
-    x, y = spawns[row, 0] + (cosine * x - sine * y), spawns[row, 1] + (sine * x + cosine * y)
-    spatial_ground.see_movers(i, physics.qpos, ground)
-    z = poses[row, 2] + spatial_ground.height(i, x, y, ground)
-    columns = ids.qpos
-    physics.qpos[i, columns[0]], physics.qpos[i, columns[1]] = x, y
-    physics.qpos[i, columns[2]] = z
-    half_cosine, half_sine = math.cos(angle / 2), math.sin(angle / 2)
-    q_w, q_x, q_y, q_z = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
-    physics.qpos[i, columns[3]] = half_cosine * q_w - half_sine * q_z
-    physics.qpos[i, columns[4]] = half_cosine * q_x - half_sine * q_y
-    physics.qpos[i, columns[5]] = half_cosine * q_y + half_sine * q_x
-    physics.qpos[i, columns[6]] = half_cosine * q_z + q_w * half_sine
-    v_x, v_y = rates[row, 0], rates[row, 1]
-    physics.qvel[i, ids.dof[0]] = cosine * v_x - sine * v_y
-    physics.qvel[i, ids.dof[1]] = sine * v_x + cosine * v_y
-    native.forward(i, body.engine)
-
-    depth = -math.inf
-    for k in range(len(corners.bodies)):
-        link = corners.bodies[k]
-        w, a = physics.xquat[i, link, 0], physics.xquat[i, link, 1]
-        b, c = physics.xquat[i, link, 2], physics.xquat[i, link, 3]
-        x, y, z = corners.places[k, 0], corners.places[k, 1], corners.places[k, 2]
-        across_x, across_y = 2 * (b * z - c * y), 2 * (c * x - a * z)
-        across_z = 2 * (a * y - b * x)
-        at_x = physics.xpos[i, link, 0] + ((x + w * across_x) + (b * across_z - c * across_y))
-        at_y = physics.xpos[i, link, 1] + ((y + w * across_y) + (c * across_x - a * across_z))
-        at_z = physics.xpos[i, link, 2] + ((z + w * across_z) + (a * across_y - b * across_x))
-        depth = max(depth, spatial_ground.height(i, at_x, at_y, ground) - at_z)
-    physics.qpos[i, columns[2]] += max(depth + CLEARANCE, 0.0)
-    native.forward(i, body.engine)
-
-
-@compiled
 def put_down_all(
     env_ids: np.ndarray,
     poses: np.ndarray,
     rates: np.ndarray,
     spawns: np.ndarray,
-    body: SpatialBodyData,
+    body: BodyData,
 ) -> None:
-    """Places bodies on the ground; takes a pack."""
+    """Places bodies on the ground; see `SpatialBody.place`. Takes a pack."""
+    ids, physics, ground, corners = body.ids, body.physics, body.ground, body.ids.corners
     for row in range(len(env_ids)):
-        put_down(env_ids[row], row, poses, rates, spawns, body)
+        i = env_ids[row]
+        for k in range(len(ids.qpos)):
+            physics.qpos[i, ids.qpos[k]] = poses[row, k]
+        for k in range(len(ids.dof)):
+            physics.qvel[i, ids.dof[k]] = rates[row, k]
+        angle = spawns[row, 2]
+        cosine, sine = math.cos(angle), math.sin(angle)
+        x, y = poses[row, 0], poses[row, 1]
+        x, y = spawns[row, 0] + (cosine * x - sine * y), spawns[row, 1] + (sine * x + cosine * y)
+        spatial_ground.see_movers(i, physics.qpos, ground)
+        z = poses[row, 2] + spatial_ground.height(i, x, y, ground)
+        columns = ids.qpos
+        physics.qpos[i, columns[0]], physics.qpos[i, columns[1]] = x, y
+        physics.qpos[i, columns[2]] = z
+        half_cosine, half_sine = math.cos(angle / 2), math.sin(angle / 2)
+        q_w, q_x, q_y, q_z = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
+        physics.qpos[i, columns[3]] = half_cosine * q_w - half_sine * q_z
+        physics.qpos[i, columns[4]] = half_cosine * q_x - half_sine * q_y
+        physics.qpos[i, columns[5]] = half_cosine * q_y + half_sine * q_x
+        physics.qpos[i, columns[6]] = half_cosine * q_z + q_w * half_sine
+        v_x, v_y = rates[row, 0], rates[row, 1]
+        physics.qvel[i, ids.dof[0]] = cosine * v_x - sine * v_y
+        physics.qvel[i, ids.dof[1]] = sine * v_x + cosine * v_y
+        native.forward(i, body.engine)
+
+        depth = -math.inf
+        for k in range(len(corners.bodies)):
+            link = corners.bodies[k]
+            w, a = physics.xquat[i, link, 0], physics.xquat[i, link, 1]
+            b, c = physics.xquat[i, link, 2], physics.xquat[i, link, 3]
+            x, y, z = corners.places[k, 0], corners.places[k, 1], corners.places[k, 2]
+            across_x, across_y = 2 * (b * z - c * y), 2 * (c * x - a * z)
+            across_z = 2 * (a * y - b * x)
+            at_x = physics.xpos[i, link, 0] + ((x + w * across_x) + (b * across_z - c * across_y))
+            at_y = physics.xpos[i, link, 1] + ((y + w * across_y) + (c * across_x - a * across_z))
+            at_z = physics.xpos[i, link, 2] + ((z + w * across_z) + (a * across_y - b * across_x))
+            depth = max(depth, spatial_ground.height(i, at_x, at_y, ground) - at_z)
+        physics.qpos[i, columns[2]] += max(depth + CLEARANCE, 0.0)
+        native.forward(i, body.engine)

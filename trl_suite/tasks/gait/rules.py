@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.bodies.blocks import Block
+from trl_suite.bodies.body import BodyData
 from trl_suite.bodies.planar import (
-    PlanarBodyData,
     breaks_down,
     has_left,
     measure,
@@ -117,7 +117,7 @@ class GaitData(NamedTuple):
       pitch, pitch_rate: columns of the observation for pitch and its rate; -1: not observed.
     """
 
-    body: PlanarBodyData
+    body: BodyData
     gait: GaitRules
     terms: Any
     interruption: np.ndarray

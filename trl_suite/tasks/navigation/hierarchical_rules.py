@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
-from trl_suite.bodies.body import MAX_JOINT_SPEED, Travel, go
+from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, go
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
 from trl_suite.bodies.spatial import (
     LINES,
-    SpatialBodyData,
     breaks_down,
     measure,
     observe_body,
@@ -100,7 +99,7 @@ class PlanningData(NamedTuple):
       plan_offset, plan_scale: offset and scale of actions.
     """
 
-    body: SpatialBodyData
+    body: BodyData
     outcome: Outcome
     clock: Clock
     travel: Travel
