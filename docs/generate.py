@@ -166,7 +166,7 @@ def environment_page(id: str) -> str:
 
 def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
     _, begin, end, _ = gallery.scene(spec.id)
-    drawn = task_type(spec).description.legend
+    drawn = describe.description_of(spec).legend
     name, _ = acting.best(environment, spec.id)
     who = WITHOUT.get(name)
     said = f'No policy is shipped; the pictures show {who}' if who else 'The shipped policy'

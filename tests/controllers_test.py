@@ -594,7 +594,7 @@ class AloneTest(parameterized.TestCase):
         gait.bind(world)
         start, skeleton = gait.parameters.start, gait.rules.skeleton
         places, rates = skeleton.qpos, skeleton.dof
-        world.qpos[0, places[1:3]] = start['height'], begin['pitch']
+        world.qpos[0, places[1:3]] = start['height'], start['pitch']
         world.qvel[0, rates[:3]] = start['velocity']
         for name, (angle, rate) in start['joints'].items():
             dof = 3 + gait.number[name]

@@ -22,8 +22,8 @@ from helpers import FolderTest
 from trl_suite import characters, cli, engine, gym, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import inspect, model_file
+from trl_suite.describe import tasks
 from trl_suite.tasks import parts
-from trl_suite.tasks.common import description
 from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain.planar import generators
 from trl_suite.util import program
@@ -532,7 +532,7 @@ class CharacterTest(WrittenTest):
         for _ in range(90):
             self.assertFalse(environment.step(np.zeros(4)).last())
         self.assertLess(root.xpos[2], 0.5)  # it lies on the ground
-        text = repr(description.fall(environment.task))
+        text = repr(tasks.fall(environment.task))
         self.assertIn('the physics diverges', text)
         self.assertNotIn('a fall: ', text)
 

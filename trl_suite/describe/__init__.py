@@ -6,7 +6,7 @@
     for title, text in describe.sections(spec, suite.make(spec.id)):  # as `trl-suite info` prints
         print(title, text)
 
-Sections that all environments share are in `common`, those of a task type in `trl_suite.tasks`;
+Sections that all environments share are in `common`, those of a task type in `tasks` and `gait`;
 `differences` lists the differences from the original.
 """
 
@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 from trl_suite.describe import common, options
 from trl_suite.describe.differences import differences_of
+from trl_suite.describe.tasks import description_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.common import description
 from trl_suite.util import tables
 from trl_suite.util.tables import Section, Table, escape, markdown, markdown_table, table
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = [
     'Section',
     'Table',
+    'description_of',
     'differences_of',
     'escape',
     'markdown',
@@ -56,19 +57,15 @@ def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
 
     The environment may be built from a spec that differs in its terrain.
     """
-    type_, task = task_type(spec), environment.task
-    if type_ is None:  # the task is made by a user's class or function
-        yield common.observation(environment)
-        yield description.action(environment)
-        yield description.time(spec, task)
-        yield options.options(spec)
-        return
-    about = type_.description
-    yield from common.character(environment, about.joints(task))
-    yield from about.before(task)
+    about, task = description_of(spec), environment.task
+    own = task_type(spec) is None  # whether the task is made by a user's class or function
+    if not own:
+        yield from common.character(environment, about.joints(task))
+        yield from about.before(task)
     yield common.observation(environment)
     yield about.action(environment)
-    yield common.ground(spec)
-    yield from about.rules(spec, task)
+    if not own:
+        yield common.ground(spec)
+        yield from about.rules(spec, task)
     yield about.time(spec, task)
     yield options.options(spec)

@@ -11,8 +11,14 @@ import numpy as np
 from trl_suite import characters, terrain
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.common.description import REWARD_WEIGHT, floats
 from trl_suite.util.tables import Section, Table, section
+
+REWARD_WEIGHT = 'reward weight'  # title of a column of links
+
+
+def floats(values: Any) -> list[float]:
+    """Returns values as Python floats."""
+    return [float(value) for value in values]
 
 
 def character(environment: Environment, joints: tuple[str, Iterable[object]]) -> Iterator[Section]:
@@ -96,4 +102,27 @@ def ground(spec: EnvSpec) -> Section:
     more = f' (set 0 of {sets}; see the option terrain_level)' if sets > 1 else ''
     return section(
         f'Terrain: {found.name} ({found.type})', f'{parameters or "no parameters"}{more}'
+    )
+
+
+def reward(task: Any, *notes: str, title: str = 'Reward of a step') -> Section:
+    """Returns the table of reward terms, and notes on them."""
+    return section(
+        f'{title}: sum of weight * exp(-scale * error), or without a scale of weight * share; at most 1; 0 '
+        'after a fall',
+        Table(
+            ('term', 'weight', 'scale', 'unit', 'error, or share'),
+            [
+                (
+                    term.name,
+                    term.weight,
+                    '' if term.scale is None else term.scale,
+                    term.unit,
+                    term.meaning,
+                )
+                for term in task.terms
+                if term.weight
+            ],
+        ),
+        *notes,
     )

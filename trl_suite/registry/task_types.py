@@ -1,11 +1,6 @@
 """The task types by name."""
 
-from trl_suite.tasks import footsteps, gait, imitation, navigation, walk
-from trl_suite.tasks.task_type import TaskType
+from trl_suite.tasks.task_type import TYPES, TaskType
 
-TASK_TYPES: dict[str, TaskType] = {
-    type_.name: type_
-    for room in (imitation, footsteps, navigation, gait, walk)
-    for type_ in room.TYPES
-}
-TITLES: tuple[str, ...] = tuple(dict.fromkeys(type_.title for type_ in TASK_TYPES.values()))
+TASK_TYPES: dict[str, TaskType] = {type_.name: type_ for type_ in TYPES}
+TITLES: tuple[str, ...] = tuple(dict.fromkeys(type_.title for type_ in TYPES))

@@ -1,65 +1,23 @@
-"""Task types: the parts and options that a kind of task takes, its constructor and description."""
+"""Task types: the parts and options that a kind of task takes, and its constructor."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+from trl_suite import motion
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.common import description
+from trl_suite.tasks.common.goals import Ball
+from trl_suite.tasks.footsteps import task as footsteps
+from trl_suite.tasks.gait.task import GaitConfig, GaitTask
+from trl_suite.tasks.imitation import task as imitation
+from trl_suite.tasks.navigation import direct
+from trl_suite.tasks.navigation.hierarchical import HierarchicalConfig, HierarchicalNavigation
 from trl_suite.tasks.task import Task
+from trl_suite.tasks.walk import task as walk
 from trl_suite.util.options import Config
-from trl_suite.util.tables import Section
-
-if TYPE_CHECKING:
-    from trl_suite.environments.environment import Environment
-    from trl_suite.registry.spec import EnvSpec
-
-
-class Difference(NamedTuple):
-    """A difference from the original, and a function that returns whether it applies to a spec."""
-
-    text: str
-    applies: Callable[[EnvSpec], bool] = lambda spec: True
-
-
-def _from(hertz: int) -> str:
-    return f'MuJoCo at 300 Hz instead of Bullet at {hertz} Hz; see the option substeps'
-
-
-FROM_1200, FROM_3000 = Difference(_from(1200)), Difference(_from(3000))
-ACTIONS = Difference('actions are in [-1, 1] and clipped; the original takes physical units')
-AXES = Difference('axes are x forward, y left, z up; the original has y up and z to the right')
-CONES = Difference('a ball joint is limited by one cone, as wide as the widest of its three ranges')
-ROTATIONS = (
-    Difference(
-        'targets of ball joints are rotation vectors about the mean pose; the option '
-        "action_offset='original' selects the original's angle and axis"
-    ),
-    Difference(
-        'rotation errors are the shortest rotation; angular velocities of character and reference are '
-        'compared in the same frame'
-    ),
-)
-OWN_CLIP = Difference(
-    "the clip was made for this suite, with gait and speed close to the original's"
-)
-START_PHASE = Difference('the start phase is drawn uniformly, not in a fixed sequence')
-LANDING = Difference('a landing error ends the episode only with the option max_landing_error')
-FACES = Difference(
-    'faces of gaps, walls and steps are exactly vertical, and every start has flat ground from -1 to 1 m',
-    lambda spec: spec.terrain != 'flat',
-)
-CUT = Difference('episodes are truncated after 256 steps (discount 1)')
-
-
-def tracking(task: Callable[..., Task]) -> Callable[[Parts, Any], Task]:
-    """Returns the `make` function of a task type, for a task class with a reference motion."""
-    return lambda parts, config: task(
-        parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-    )
 
 
 class Parts(NamedTuple):
@@ -79,27 +37,6 @@ class Parts(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Description:
-    """Functions that describe a task, for `trl-suite info` and the documentation pages.
-
-    Attributes:
-      rules: spec, task -> sections on motion, reward and termination.
-      before: task -> sections before the section on the observation.
-      action: environment -> section on the meaning of actions.
-      time: spec, task -> section on rates and limits.
-      joints: task -> title of the last column in the table of links, and its entry for each joint.
-      legend: meaning of the markers in rendered images.
-    """
-
-    rules: Callable[[EnvSpec, Any], Iterator[Section]] = lambda spec, task: iter(())
-    before: Callable[[Any], Iterator[Section]] = lambda task: iter(())
-    action: Callable[[Environment], Section] = description.action
-    time: Callable[[EnvSpec, Any], Section] = description.time
-    joints: Callable[[Any], tuple[str, Iterable[object]]] = description.reward_weights
-    legend: str = ''
-
-
-@dataclasses.dataclass(frozen=True)
 class TaskType:
     """A kind of task.
 
@@ -109,13 +46,11 @@ class TaskType:
       spatial: whether it is for three-dimensional characters, not for planar ones.
       config: class of its options.
       make: parts, config -> task.
-      description: functions that describe it.
       motion: type of the reference motion: `Clip`, `FootstepLibrary`, or None.
       actuations: supported actuation models; None for all of them.
       options: options for `suite.build` that differ from the defaults.
       score: the main performance measure, a key of the result of `evaluation.evaluate`.
       samples: name of the steps where they are counted, e.g. 'cycles'.
-      differences: differences from the original.
     """
 
     name: str
@@ -123,10 +58,93 @@ class TaskType:
     spatial: bool
     config: type[Config]
     make: Callable[[Parts, Any], Task]
-    description: Description
     motion: type[Clip] | type[FootstepLibrary] | None = None
     actuations: tuple[str, ...] | None = None
     options: tuple[tuple[str, Any], ...] = ()
     score: str = 'normalized_return'
     samples: str = 'control steps'
-    differences: tuple[Difference, ...] = ()
+
+
+def tracking(task: Callable[..., Task], **more: Any) -> Callable[[Parts, Any], Task]:
+    """Returns the `make` function of a task class with a reference motion; `more`: arguments."""
+    return lambda parts, config: task(
+        parts.character,
+        parts.arena,
+        parts.motion,
+        config,
+        actuation_model=parts.actuation,
+        **{name: made(parts.arena) for name, made in more.items()},
+    )
+
+
+def _direct(parts: Parts, config: Any) -> Task:
+    if config.reward == 'original':
+        steps = motion.load_steps(parts.character.spec.name)
+        return direct.hidden_plan(parts.character, parts.arena, steps, config, parts.actuation)
+    return tracking(direct.DirectNavigation)(parts, config)
+
+
+def _walk(parts: Parts, config: Any) -> Task:
+    return walk.Walk(parts.character, parts.arena, config, actuation_model=parts.actuation)
+
+
+def _tracking(name: str, spatial: bool, task: Any, kind: Any) -> TaskType:
+    """Returns the type of a task of imitation or footsteps."""
+    full = f'{"spatial" if spatial else "planar"}_{name}'
+    return TaskType(full, name, spatial, task.CONFIG, tracking(task), kind)
+
+
+def _planned(name: str, **more: Any) -> TaskType:
+    """Returns the type of a task whose actions are plans."""
+    return TaskType(
+        name,
+        name,
+        True,
+        HierarchicalConfig,
+        tracking(HierarchicalNavigation, **more),
+        FootstepLibrary,
+        actuations=('position',),
+        samples='plans',
+    )
+
+
+TYPES = (
+    _tracking('imitation', False, imitation.PlanarImitation, Clip),
+    _tracking('imitation', True, imitation.SpatialImitation, Clip),
+    _tracking('footsteps', False, footsteps.PlanarFootsteps, Clip),
+    _tracking('footsteps', True, footsteps.SpatialFootsteps, FootstepLibrary),
+    _planned('goal_navigation'),
+    _planned('soccer', ball=Ball),
+    TaskType(
+        'direct_navigation', 'direct_navigation', True, direct.DirectNavigationConfig, _direct, Clip
+    ),
+    TaskType(
+        'direct_soccer',
+        'direct_soccer',
+        True,
+        direct.DirectConfig,
+        tracking(direct.DirectNavigation, ball=Ball),
+        Clip,
+    ),
+    TaskType(
+        'gait',
+        'gait',
+        False,
+        GaitConfig,
+        lambda parts, config: GaitTask(parts.character, parts.arena, config),
+        actuations=('gait',),
+        score='distance',
+        samples='cycles',
+    ),
+    *(
+        TaskType(
+            f'{"spatial" if spatial else "planar"}_walk',
+            'walk',
+            spatial,
+            config,
+            _walk,
+            options=(('rewards', walk.WALK),),
+        )
+        for spatial, config in walk.Walk.CONFIG.items()
+    ),
+)

@@ -150,6 +150,8 @@ class HierarchicalNavigation(Planned, GoalTask):
         steps: FootstepLibrary,
         config: HierarchicalConfig = HierarchicalConfig(),
         ball: Ball | None = None,
+        *,
+        actuation_model: str = 'position',
     ) -> None:
         """Composes the task.
 
@@ -159,6 +161,7 @@ class HierarchicalNavigation(Planned, GoalTask):
           steps: library of single steps of this character, for the initial pose and the clock.
           config: the options.
           ball: a ball of the arena, for dribbling; the terrain must be level.
+          actuation_model: 'position'.
 
         Raises:
           ValueError: parts that are incompatible.
@@ -166,7 +169,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         check_two_feet(character.spec)
         self.ball, self.goal_distance = ball, config.goal_distance
         self.terms = soccer_terms() if ball else NAVIGATION_TERMS
-        super().__init__(character, arena, steps, config, 'position')
+        super().__init__(character, arena, steps, config, actuation_model)
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
         blocks = *self.figure.blocks, PHASE, CONTACT, PLAN

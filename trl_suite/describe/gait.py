@@ -1,23 +1,19 @@
-"""Descriptions of gait tasks in text and tables."""
+"""How gait tasks are described in text and tables."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from trl_suite.tasks.common import description
-from trl_suite.tasks.common.description import floats
+from trl_suite.describe.common import floats, reward
+from trl_suite.environments.environment import Environment
+from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
 from trl_suite.tasks.rewards import fall_condition
-from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
-
-if TYPE_CHECKING:
-    from trl_suite.environments.environment import Environment
-    from trl_suite.registry.spec import EnvSpec
 
 # Units of gait parameters that are not angles, by name without state.
 _UNITS = {
@@ -121,7 +117,7 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
         notes.append(f'links that may touch the ground: {", ".join(figure.stumble_exempt)}')
     if not parameters.backward_reward:
         notes.append('0 if the speed is negative')
-    yield description.reward(task, *notes, title='Reward of a cycle')
+    yield reward(task, *notes, title='Reward of a cycle')
     links = ', '.join(figure.fall_links)
     ends = [
         f'{"one of " if len(figure.fall_links) > 1 else ""}{links} {fall_condition()}',
@@ -157,6 +153,3 @@ def joints(task: Any) -> tuple[str, list[object]]:
     return 'target relative to', [
         'the world' if joint in hips else 'its parent' for joint in joints
     ]
-
-
-GAIT = Description(rules=rules, before=before, action=action, time=time, joints=joints)
