@@ -173,7 +173,9 @@ def _plans(task: Any) -> list[str]:
     push = task.config.pushes
     if push is not None:
         (low, high), unit = (push.speed, 'm/s') if push.force is None else (push.force, 'N')
-        lines.append(f'the {push.body or "torso"} is pushed repeatedly with {low:g} to {high:g} {unit}')
+        lines.append(
+            f'the {push.body or "torso"} is pushed repeatedly with {low:g} to {high:g} {unit}'
+        )
     return lines
 
 

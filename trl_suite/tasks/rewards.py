@@ -52,15 +52,6 @@ def outcome(n: int, size: int, terms: int = 0) -> Outcome:
 
 
 @compiled
-def begin(i: int, outcome: Outcome) -> None:
-    """Resets the outcome of a simulation, except its observation."""
-    outcome.reward[i] = 0.0
-    outcome.failed[i] = outcome.diverged[i] = outcome.fell[i] = False
-    for k in range(outcome.reward_terms.shape[1]):
-        outcome.reward_terms[i, k] = 0.0
-
-
-@compiled
 def conclude(i: int, failed: bool, outcome: Outcome) -> None:
     """Sets the reward to the sum of its terms, or both to 0 if the episode has failed."""
     outcome.failed[i] = failed

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
-from trl_suite.bodies.body import Body, Measurement
-from trl_suite.bodies.reference import Clock
+from trl_suite.bodies.body import Measurement
 from trl_suite.motion import quaternion
-from trl_suite.tasks.common.footstep_plan import SIDE, FootstepPlan
+from trl_suite.tasks.common.footstep_plan import SIDE, Planned
 from trl_suite.tasks.footsteps.rules import FootstepState
+from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.util.options import Config, Range, option
 
 # Meanings of options of all tasks that follow footstep plans.
@@ -77,64 +76,42 @@ class Plans(Config):
     )
 
 
-class Planner:
-    """Draws the footstep plans of all simulations.
+class PlanTask(Planned, TrackingTask):
+    """A body that tracks footsteps; plans are drawn at the start of an episode and at each landing.
 
-    It writes landing places and headings to the plan. To the state of the task it writes sizes of
-    steps, goals, and until when landing errors do not count after a sharp turn.
+    Landing places and headings are written to the plan; sizes of steps, goals, and until when landing
+    errors do not count after a sharp turn, to the state.
+
+    Attributes:
+      state: state in addition to the plan.
+      goal_given: whether plans lead to goals.
     """
 
-    def __init__(
-        self,
-        plans: Plans,
-        figure: Body,
-        plan: FootstepPlan,
-        state: FootstepState,
-        clock: Clock,
-        random: list[np.random.Generator],
-        *,
-        goals: bool,
-        grace_steps: int,
-    ) -> None:
-        """Keeps what it draws from and writes to.
+    state: FootstepState
+    goal_given = False
+    _grace_steps = 0  # control steps after a sharp turn in which landing errors do not count
+    _drawn_plans: Plans  # how plans are drawn; for planar characters without what they have not
 
-        Args:
-          plans: how plans are drawn.
-          figure: the body, for heights of landing places, and its arena, which draws goals.
-          plan: the plan of each simulation, written here.
-          state: the state of the task, written here.
-          clock: the clocks.
-          random: the random generator of each simulation; a list that the task updates.
-          goals: whether plans lead to goals.
-          grace_steps: control steps after a sharp turn in which landing errors do not count.
-        """
-        self._plans, self._figure, self._clock, self._random = plans, figure, clock, random
-        self._arena: Any = figure.arena
-        self._sideways = figure.character.spec.spatial  # whether steps have a width
-        self._plan, self._state = plan, state
-        self._goals, self._grace_steps = goals, grace_steps
-
-    def begin(self, env_ids: np.ndarray, origins: np.ndarray, measurement: Measurement) -> None:
+    def _begin_plans(self, env_ids: np.ndarray, measurement: Measurement) -> None:
         """Draws the first plans of episodes, and their first goals.
 
         Args:
           env_ids: indices of simulations, (m,), whose stance feet are known.
-          origins: start positions x, y (m) and headings (rad), (m, 3).
           measurement: measurement of the characters.
         """
-        plan, state = self._plan, self._state
+        plan, state, origins = self.plan, self.state, self.travel.origin[env_ids]
         aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
         for k, i in enumerate(env_ids.tolist()):
             self._redraw_size(i, always=True)
             aside[k] = state.width[i]
-            if self._goals:
-                state.goal[i] = self._arena.goal(i, self._random[i], origins[k, :2], 'near')
+            if self.goal_given:
+                state.goal[i] = self.arena.goal(i, self._random[i], origins[k, :2], 'near')
             sizes[k] = self._next_size(i), self._next_size(i)
         places, angles = origins[:, :2], origins[:, 2]
         plan.heading[env_ids] = angles
         stance = plan.stance[env_ids]
         anchors = measurement.feet[env_ids, stance, :2]
-        if self._goals:
+        if self.goal_given:
             self._head_for_goals(env_ids, measurement.root[env_ids, :2])
         else:
             # The feet land on both sides of a line through the start, at half a width from it.
@@ -144,14 +121,14 @@ class Planner:
         for which, foot in enumerate((1 - stance, stance)):
             anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
 
-    def replan(self, env_ids: np.ndarray, measurement: Measurement) -> None:
+    def _replan(self, env_ids: np.ndarray, measurement: Measurement) -> None:
         """Draws the next plans of some simulations at a switch of stance.
 
         Args:
           env_ids: indices of simulations, (m,).
           measurement: measurement of the characters.
         """
-        plans, plan, count = self._plans, self._plan, len(env_ids)
+        plans, plan, count = self._drawn_plans, self.plan, len(env_ids)
         by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
         for k, i in enumerate(env_ids.tolist()):
             random = self._random[i]
@@ -162,13 +139,13 @@ class Planner:
                     ahead = random.uniform(*plans.root_length)
                     sizes[k, which] = ahead, random.uniform(*plans.root_width)
                 continue
-            if self._goals:
-                root, goal = measurement.root[i, :2], self._state.goal
+            if self.goal_given:
+                root, goal = measurement.root[i, :2], self.state.goal
                 if np.hypot(*(root - goal[i, :2])) < GOAL_REACHED:
-                    goal[i] = self._arena.goal(i, random, root, 'near')
+                    goal[i] = self.arena.goal(i, random, root, 'near')
             elif plans.sharp and random.uniform() < plans.sharp:
                 turns[k] = random.uniform(-np.pi, np.pi)
-                self._state.excused[i] = self._clock.steps[i] + self._grace_steps
+                self.state.excused[i] = self.clock.steps[i] + self._grace_steps
             elif plans.turn:
                 turns[k] = random.normal(0, plans.turn)
             sizes[k, 1] = self._next_size(i)
@@ -176,7 +153,7 @@ class Planner:
         on = ~by_root
         if on.any():
             going = env_ids[on]
-            if self._goals:
+            if self.goal_given:
                 self._head_for_goals(going, plan.landing[going, :, :2].mean(1))
             plan.heading[going] += turns[on]
             plan.landing[going, 0] = plan.landing[going, 1]
@@ -191,23 +168,23 @@ class Planner:
 
     def _redraw_size(self, i: int, always: bool = False) -> None:
         """Redraws length and width of steps, always or with probability `change`."""
-        plans, random = self._plans, self._random[i]
+        plans, random = self._drawn_plans, self._random[i]
         if always or random.uniform() < plans.change:
-            self._state.length[i] = random.uniform(*plans.length)
-            if self._sideways:
-                self._state.width[i] = random.uniform(*plans.width)
+            self.state.length[i] = random.uniform(*plans.length)
+            if self._spatial:
+                self.state.width[i] = random.uniform(*plans.width)
 
     def _next_size(self, i: int) -> tuple[float, float]:
         """Returns length and width of the next step, m; redraws them with probability `change`."""
         self._redraw_size(i)
-        return float(self._state.length[i]), float(self._state.width[i])
+        return float(self.state.length[i]), float(self.state.width[i])
 
     def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
         """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
-        displacement = self._state.goal[env_ids, :2] - places
+        displacement = self.state.goal[env_ids, :2] - places
         headings = np.arctan2(displacement[:, 1], displacement[:, 0])
         far = np.hypot(displacement[:, 0], displacement[:, 1]) > NEAR_GOAL
-        self._plan.heading[env_ids[far]] = headings[far]
+        self.plan.heading[env_ids[far]] = headings[far]
 
     def _lay(
         self,
@@ -231,7 +208,7 @@ class Planner:
         """
         steps = sizes.copy()
         steps[:, 1] *= SIDE[feet]
-        places = places + quaternion.rotate_xy(steps, self._plan.heading[env_ids])
-        self._plan.landing[env_ids, which, :2] = places
-        self._plan.landing[env_ids, which, 2] = self._figure.heights(env_ids, places)
+        places = places + quaternion.rotate_xy(steps, self.plan.heading[env_ids])
+        self.plan.landing[env_ids, which, :2] = places
+        self.plan.landing[env_ids, which, 2] = self.figure.heights(env_ids, places)
         return places

@@ -28,7 +28,6 @@ from trl_suite.tasks.common.footstep_plan import (
     PLAN,
     RIGHT,
     FootstepPlan,
-    Planned,
     check_two_feet,
     plan_markers,
 )
@@ -36,8 +35,8 @@ from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
 from trl_suite.tasks.footsteps.planner import (
     FOOTSTEP_SCALE,
     MAX_LANDING_ERROR,
-    Planner,
     Plans,
+    PlanTask,
     StraightPlans,
 )
 from trl_suite.tasks.footsteps.rules import (
@@ -51,7 +50,6 @@ from trl_suite.tasks.footsteps.rules import (
     observe_all,
 )
 from trl_suite.tasks.task import Marker
-from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.tasks.variation.pushes import PushConfig, Pushes
 from trl_suite.util.options import Range, option
 
@@ -108,19 +106,17 @@ class SpatialFootstepsConfig(MirroredConfig):
             raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
 
 
-class Footsteps(Planned, TrackingTask):
+class Footsteps(PlanTask):
     """A biped tracks a plan of footsteps, two steps per cycle of its clock.
 
     Attributes:
       plans: how they are drawn.
-      state: further state of the task.
     """
 
     ABOUT = 'root'
     finish_all, observe_all = finish_all, observe_all
     plans: Any  # Plans or StraightPlans
-    goal_given = hidden_plan = False
-    _grace_steps = 0
+    hidden_plan = False
 
     def _bind(self, world: World) -> FootstepData:
         tracking, n, config = super()._bind(world), world.n, self.config
@@ -129,16 +125,6 @@ class Footsteps(Planned, TrackingTask):
         self.info_arrays |= {
             name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
         }
-        self._planner = Planner(
-            self._drawn_plans(),
-            self.figure,
-            self.plan,
-            self.state,
-            self.clock,
-            self._random,
-            goals=self.goal_given,
-            grace_steps=self._grace_steps,
-        )
         limit = config.max_landing_error
         return FootstepData(
             tracking=tracking,
@@ -149,10 +135,6 @@ class Footsteps(Planned, TrackingTask):
             heading_scale=float(getattr(config, 'heading_scale', 1.0)),
             largest_miss=np.inf if limit is None else float(limit),
         )
-
-    def _drawn_plans(self) -> Plans:
-        """Returns how plans are drawn, of spatial characters and of planar ones."""
-        return self.plans
 
     @property
     def max_landing_error(self) -> float | None:
@@ -173,7 +155,7 @@ class Footsteps(Planned, TrackingTask):
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
         state.excused[env_ids] = 0
-        self._planner.begin(env_ids, self.travel.origin[env_ids], measurement)
+        self._begin_plans(env_ids, measurement)
         align_all(env_ids, self._first_tracks(env_ids), self._pack)
 
     @abc.abstractmethod
@@ -190,7 +172,7 @@ class Footsteps(Planned, TrackingTask):
         measurement = self.figure.measure(env_ids, stepped=True)
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
-            self._planner.replan(switched, measurement)
+            self._replan(switched, measurement)
             align_all(switched, self._choose(switched, measurement), self._pack)
             self.finish_all(switched, self._pack)
 
@@ -217,7 +199,7 @@ class SpatialFootsteps(Footsteps):
 
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         check_two_feet(character.spec)
-        self.plans = config.plans
+        self.plans = self._drawn_plans = config.plans
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
         self.hidden = ('contact', 'plan') if config.hidden_plan else ()
         self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
@@ -302,12 +284,10 @@ class PlanarFootsteps(Footsteps):
 
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         check_feet(character.spec)
-        self.plans = config.plans
+        self.plans, nothing = config.plans, Range(0.0, 0.0)
+        given = {'length': self.plans.length, 'change': self.plans.change}
+        self._drawn_plans = Plans(**given, width=nothing, turn=0.0, sharp=0.0)
         return CONTACT, PLAN, GOAL.observed_if(False)
-
-    def _drawn_plans(self) -> Plans:
-        length, change = self.plans.length, self.plans.change
-        return Plans(length=length, change=change, width=Range(0.0, 0.0), turn=0.0, sharp=0.0)
 
     def _track(self) -> Reference:
         reference = super()._track()

@@ -26,7 +26,6 @@ from trl_suite.tasks.rewards import (
     FALL_THRESHOLD,
     Outcome,
     Term,
-    begin,
     conclude,
     give,
     sample_fall,
@@ -278,20 +277,6 @@ def observed_blocks(
     )  # fmt: skip
 
 
-@compiled
-def begin_episode(i: int, data: GaitData) -> None:
-    """Resets state machine, outcome and state of the task."""
-    state, ids, physics = data.state, data.body.ids, data.body.physics
-    gaits.begin(i, data.action_offset, data.gait)
-    begin(i, data.outcome)
-    state.going[i], state.waiting[i] = False, True
-    state.lasted[i] = state.stumbled[i] = state.age[i] = 0
-    state.down[i] = state.duration[i] = state.stumbling[i] = 0.0
-    state.fell[i] = state.stuck[i] = False
-    state.milestone[i, 0] = physics.qpos[i, ids.qpos[0]]
-    state.milestone[i, 1] = physics.qpos[i, ids.qpos[1]]
-
-
 # Loops over simulations; they take packs.
 
 
@@ -338,8 +323,14 @@ def finish_steps(env_ids: np.ndarray, data: GaitData) -> None:
 
 @compiled
 def observe_all(env_ids: np.ndarray, fresh: bool, data: GaitData) -> None:
-    """Writes observations; if `fresh`, episodes have just begun, and their state is reset."""
+    """Writes observations; if `fresh`, episodes have just begun, as do their gaits."""
+    state, ids, qpos = data.state, data.body.ids, data.body.physics.qpos
     for i in env_ids:
         if fresh:
-            begin_episode(i, data)
+            gaits.begin(i, data.action_offset, data.gait)
+            state.waiting[i] = True
+            state.milestone[i, 0], state.milestone[i, 1] = (
+                qpos[i, ids.qpos[0]],
+                qpos[i, ids.qpos[1]],
+            )
         observe(i, data)

@@ -244,7 +244,9 @@ class GaitTask(Task):
             self.arena.begin_episode(i, strip)
         self.world.reset(env_ids)
         self.figure.place(env_ids, poses, rates, extents)
-        self._observe(env_ids, True)
+        for array in (*self.state, *self.outcome[1:]):  # all but the observation
+            array[env_ids] = 0
+        observe_all(env_ids, True, self._pack)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         begin_steps(env_ids, action, self._pack)
@@ -264,7 +266,5 @@ class GaitTask(Task):
         finish_steps(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        self._observe(self.world.all_ids if env_ids is None else env_ids, False)
-
-    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        observe_all(env_ids, fresh, self._pack)
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        observe_all(env_ids, False, self._pack)

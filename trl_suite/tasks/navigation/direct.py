@@ -105,22 +105,7 @@ class DirectData(NamedTuple):
     progress: Progress
 
 
-# A step of simulation i, after the body was measured: `advance`, the next goal if one is needed, then
-# `compare` and `observe`.
-
-
-@compiled
-def advance(i: int, data: DirectData) -> bool:
-    """Tests goal and ball; returns whether one of them must be redrawn."""
-    tracking, aims = data.tracking, data.aims
-    aims.goals.wanted[i] = aims.ball.wanted[i] = False
-    if not proceed(i, tracking):
-        return False
-    count, measurement = tracking.clock.steps[i], tracking.measurement
-    follow(i, count, measurement.com, aims.trace)
-    if aims.with_ball:
-        dribble(i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome)
-    return test_goal(i, count, measurement, aims)
+# A step, after bodies were measured: `advance_all`, the next goals if some are needed, `finish_all`.
 
 
 @compiled
@@ -166,9 +151,15 @@ def observe(i: int, data: DirectData) -> None:
 @compiled
 def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     """Tests goals and balls; returns in how many simulations one must be redrawn."""
-    wanted = 0
+    wanted, aims, tracking = 0, data.aims, data.tracking
+    measurement, steps = tracking.measurement, tracking.clock.steps
     for i in env_ids:
-        wanted += advance(i, data)
+        aims.goals.wanted[i] = aims.ball.wanted[i] = False
+        if proceed(i, tracking):
+            follow(i, steps[i], measurement.com, aims.trace)
+            if aims.with_ball:
+                dribble(i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome)
+            wanted += test_goal(i, steps[i], measurement, aims)
     return wanted
 
 

@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import SpatialArena
-from trl_suite.bodies.blocks import Block, columns, layout
+from trl_suite.bodies.blocks import Block, columns, layout, reflected, signs
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, PHASE
-from trl_suite.bodies.spatial import body_blocks
+from trl_suite.bodies.spatial import LINK_POSE, body_blocks
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.motion import FootstepLibrary
+from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.common.control import MOST_SUBSTEPS, SUBSTEPS, GroundConfig
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
@@ -57,17 +59,18 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     score_all,
     show_plans,
 )
-from trl_suite.tasks.navigation.plan_actions import (
-    INTERFACES,
-    PLAN_NAMES,
-    STEP_LENGTH,
-    plan_action_map,
-    planning_mirror,
-)
 from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import Marker, check_simulated, drawn_seed
 from trl_suite.util.options import Range, option
 
+INTERFACES = ('plan', 'frame')
+# A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
+# at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
+PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
+PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
+PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
+STEP_LENGTH = 0.5  # m
+PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
 TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 
 
@@ -327,3 +330,32 @@ class HierarchicalNavigation(Planned, GoalTask):
         """Returns markers of the plan, past positions of the centre of mass, and the goal."""
         root = self.world.xpos[env_id, self.figure.links[0]]
         return [*plan_markers(env_id, root, self.plan), *super().markers(env_id)]
+
+
+def plan_action_map(step_length: float, joint_map: ActionMap | None = None) -> ActionMap:
+    """Returns the map from actions to plans.
+
+    Args:
+      step_length: step length of the plan at action 0, m.
+      joint_map: the map of actions to joint targets, with the interface 'frame': these actions
+        follow those of the plan, and are passed on as they are.
+    """
+    names, offset, scale = PLAN_NAMES, step_length * PLAN_OFFSET, PLAN_SCALE
+    if joint_map is not None:
+        names = (*names, *joint_map.names)
+        offset = np.concatenate([offset, np.zeros(len(joint_map))])
+        scale = np.concatenate([scale, np.ones(len(joint_map))])
+    return ActionMap(names, 'footstep plan', 'm (turn: rad)', offset, scale)
+
+
+def planning_mirror(character: Character, blocks: tuple[Block, ...]) -> Mirror:
+    """Returns the reflection of observations with these blocks, and of plans.
+
+    Args:
+      character: the character, which has pairs of right and left links.
+      blocks: the observation blocks.
+    """
+    links = list(character.spec.links)
+    feet = [links.index(name) for name in character.spec.end_effectors]
+    right, left = layout(blocks)['pose'].start + 1 + LINK_POSE * np.array(feet)
+    return Mirror(*reflected(blocks), *signs(PLAN_SIGNS), feet=(right, left))

@@ -115,23 +115,8 @@ class PlanningData(NamedTuple):
     plan_scale: np.ndarray
 
 
-# A step of simulation i: `begin_step`; then for every control step the action of the footstep
-# controller, physics and `finish_control_step`; then `score`, the next goal if one is needed,
-# `finish`.
-
-
-@compiled
-def begin_step(i: int, action: np.ndarray, data: PlanningData) -> None:
-    """Sets the plan if a footstep begins, and writes the footstep controller's observation."""
-    body, state = data.body, data.state
-    look(i, data)
-    lay_plan(i, action, data)
-    state.lasted[i] = 0
-    for k in range(3):
-        state.begin[i, k] = body.measurement.com[i, k]
-    remember(i, body.physics, body.measurement, data.aims)
-    data.plan.landed[i] = False
-    observe_for_controller(i, data)
+# A step: `begin_steps`; then for every control step the action of the footstep controller, physics and
+# `finish_control_steps`; then `score_all`, the next goals if some are needed, `finish_all`.
 
 
 @compiled
@@ -231,15 +216,6 @@ def score(i: int, data: PlanningData) -> bool:
 
 
 @compiled
-def finish(i: int, data: PlanningData) -> None:
-    """Computes reward and observation."""
-    outcome = data.outcome
-    conclude(i, outcome.failed[i], outcome)
-    if not outcome.diverged[i]:  # otherwise keeps the last finite observation
-        observe(i, data)
-
-
-@compiled
 def observe(i: int, data: PlanningData) -> None:
     """Writes the observation."""
     body, measurement, columns = data.body, data.body.measurement, data.columns
@@ -261,9 +237,17 @@ def observe(i: int, data: PlanningData) -> None:
 
 @compiled
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
-    """Begins steps."""
+    """Sets plans where footsteps begin, and writes the footstep controller's observations."""
+    body, state = data.body, data.state
     for i in env_ids:
-        begin_step(i, action, data)
+        look(i, data)
+        lay_plan(i, action, data)
+        state.lasted[i] = 0
+        for k in range(3):
+            state.begin[i, k] = body.measurement.com[i, k]
+        remember(i, body.physics, body.measurement, data.aims)
+        data.plan.landed[i] = False
+        observe_for_controller(i, data)
 
 
 @compiled
@@ -296,9 +280,11 @@ def score_all(env_ids: np.ndarray, data: PlanningData) -> int:
 
 @compiled
 def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
-    """Finishes steps."""
+    """Computes rewards and observations."""
     for i in env_ids:
-        finish(i, data)
+        conclude(i, data.outcome.failed[i], data.outcome)
+        if not data.outcome.diverged[i]:  # otherwise keeps the last finite observation
+            observe(i, data)
 
 
 @compiled

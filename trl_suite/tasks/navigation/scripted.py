@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.tasks.common.footstep_plan import SIDE
-from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
-from trl_suite.tasks.navigation.plan_actions import PLAN_NAMES
+from trl_suite.tasks.navigation.hierarchical import PLAN_NAMES, HierarchicalNavigation
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = (
