@@ -289,11 +289,7 @@ class PlanarBody(Body):
 
 @compiled
 def put_down_all(
-    env_ids: np.ndarray,
-    poses: np.ndarray,
-    rates: np.ndarray,
-    extents: np.ndarray,
-    body: BodyData,
+    env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray, body: BodyData
 ) -> None:
     """Writes poses and velocities of bodies placed at x = 0; see `PlanarBody.place`."""
     ids, physics, ground = body.ids, body.physics, body.ground

@@ -388,11 +388,7 @@ def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
 
 @compiled
 def put_down_all(
-    env_ids: np.ndarray,
-    poses: np.ndarray,
-    rates: np.ndarray,
-    spawns: np.ndarray,
-    body: BodyData,
+    env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, body: BodyData
 ) -> None:
     """Places bodies on the ground; see `SpatialBody.place`. Takes a pack."""
     ids, physics, ground, corners = body.ids, body.physics, body.ground, body.ids.corners

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.bodies.planar import PlanarState
+from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import dynamics, parameters
 from trl_suite.controllers.dynamics import Mechanics
@@ -102,17 +103,12 @@ class Gait:
             * dynamics.GRAVITY,
         )
         n, size, count = world.n, len(skeleton.dof), len(self.number)
-        self.state = GaitState(
-            vector=np.tile(gait.action_offset, (n, 1)),
-            number=np.zeros(n, int),
-            phase=np.zeros(n),
-            target=np.zeros((n, count)),
-            stance=np.zeros(n, int),
-            rising=np.zeros(n, bool),
-            airborne=np.zeros(n, bool),
-        )
-        shapes = (count,), (size, size), (size,), (4, size)
-        scratch = Scratch(*(np.zeros((n, *shape)) for shape in shapes))
+        vector, angles = gait.action_offset, np.zeros(count)
+        self.state = allocated(GaitState, n, vector=vector, target=angles)
+        self.state.vector[:] = vector
+        matrix, support = np.zeros((size, size)), np.zeros((4, size))
+        rows = {'torque': angles, 'matrix': matrix, 'vector': np.zeros(size), 'support': support}
+        scratch = allocated(Scratch, n, **rows)
         physics = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
         mechanics = Mechanics(*(getattr(world, name) for name in Mechanics._fields))
         self.rules = GaitRules(skeleton, physics, mechanics, machine, self.state, scratch)

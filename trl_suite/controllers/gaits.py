@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trl_suite.bodies.planar import PlanarState
+from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.controllers.dynamics import (
     Mechanics,
     Skeleton,
@@ -83,21 +84,21 @@ class GaitState(NamedTuple):
 
     Attributes:
       vector: parameters of the current cycle, (n, P).
+      target: joint targets, (n, J) rad (prismatic: m).
       number: number of the current state, (n,).
       phase: elapsed fraction of the duration of the state, (n,).
-      target: joint targets, (n, J) rad (prismatic: m).
       stance: stance leg of a stride, 0 right, 1 left, (n,).
       rising: whether the hopper's root was moving up at the last control step, (n,).
       airborne: whether the next cycle begins in the air, as the first one does, (n,).
     """
 
     vector: np.ndarray
-    number: np.ndarray
-    phase: np.ndarray
     target: np.ndarray
-    stance: np.ndarray
-    rising: np.ndarray
-    airborne: np.ndarray
+    number: np.ndarray = WHOLE
+    phase: np.ndarray = REAL
+    stance: np.ndarray = WHOLE
+    rising: np.ndarray = FLAG
+    airborne: np.ndarray = FLAG
 
 
 class Scratch(NamedTuple):

@@ -57,18 +57,13 @@ REWARD = {'speed': 0.8, 'stumble': 0.2}
 class Parameters:
     """The parameter vectors of one character's gait.
 
+    Other attributes are entries of its file, see the module.
+
     Attributes:
-      character: name of the character.
-      kind: one of `KINDS`.
-      legs: joints of each leg, the hip first.
-      feet: links that touch the ground, one for each leg.
-      targets: parameter of a state -> the joints whose target it is.
       names: names of the P parameters, e.g. 'Cv' or 'Gather.Hip'.
       misc: number of parameters before those of the states.
-      states: names of the states.
       actions: indices of the a parameters that an action sets.
       absolute: indices of parameters of which the absolute value is used.
-      target_speed: m/s.
       sets: name -> vector, (P,).
       base_actions: vectors of the base actions, (B, P).
       blends: for each base action, two sets and the share of the second.
@@ -76,13 +71,6 @@ class Parameters:
       action_scale: largest deviation of a base action from action_offset, (P,), the change per unit
         action: all base actions are in [-1, 1].
       search_scale: standard deviation for a search, (P,).
-      start: initial state, see the module.
-      gravity_compensation: whether legs of a bound on the ground support the weight.
-      forward_only: whether moving backwards is a fall.
-      backward_reward: whether the reward of a cycle with negative speed can be positive.
-      reward: weights of the reward terms, by name.
-      observe_pitch: whether pitch and its rate are observed instead of z of the last link and its
-        rate.
     """
 
     character: str

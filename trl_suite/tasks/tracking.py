@@ -32,12 +32,7 @@ from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.common.control import (
-    check_motion,
-    cycle_poses,
-    joint_options,
-    start_phases,
-)
+from trl_suite.tasks.common.control import check_motion, cycle_poses, joint_options, start_phases
 from trl_suite.tasks.common.footstep_plan import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.rewards import Comparison, Outcome, comparison, conclude
 from trl_suite.tasks.task import Task, drawn_seed
@@ -132,8 +127,6 @@ class BodyTask(Task):
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         """Called by `reset` after the characters of some simulations were placed."""
 
-    # Binding.
-
     @property
     def root_entity(self) -> PlanarArena | SpatialArena:
         return self.arena
@@ -155,8 +148,6 @@ class BodyTask(Task):
     def cycles(self) -> np.ndarray:
         """Time in periods of the motion: the phase, not wrapped, (n,)."""
         return self.clock.cycles
-
-    # Episodes and steps.
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         self.world.reset(env_ids)

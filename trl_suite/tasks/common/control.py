@@ -238,9 +238,7 @@ def _original(character: Character) -> dict[str, Any]:
     return {'action_offset': ranges.mean(1), 'action_scale': 2 * (ranges[:, 1] - ranges[:, 0])}
 
 
-def start_phases(
-    option: float | Sequence[Sequence[float]] | None,
-) -> Callable[[float], float]:
+def start_phases(option: float | Sequence[Sequence[float]] | None) -> Callable[[float], float]:
     """Returns a function from a uniform draw in [0, 1) to the phase at the start of an episode.
 
     Args:

@@ -125,11 +125,7 @@ def update_stance(i: int, phase: float, measurement: Measurement, plan: Footstep
 
 @compiled
 def observe_plan(
-    i: int,
-    columns: Any,
-    measurement: Measurement,
-    plan: FootstepPlan,
-    observation: np.ndarray,
+    i: int, columns: Any, measurement: Measurement, plan: FootstepPlan, observation: np.ndarray
 ) -> None:
     """Writes the blocks `CONTACT` and `PLAN`; see `Footsteps`."""
     column = columns.plan

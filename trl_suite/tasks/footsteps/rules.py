@@ -33,9 +33,7 @@ HEADING = Term(
     '((1 + cos error) / 2)^4, error: angle between heading and planned heading',
 )
 PLANAR_HEADING = Term(
-    'heading',
-    HEADING_WEIGHT,
-    '1 while the trunk points forwards, 0 while it points backwards',
+    'heading', HEADING_WEIGHT, '1 while the trunk points forwards, 0 while it points backwards'
 )
 TERMS, PLANAR_TERMS = (*STEP_TERMS, HEADING), (*STEP_TERMS, PLANAR_HEADING)
 

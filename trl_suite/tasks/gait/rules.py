@@ -10,12 +10,7 @@ import numpy as np
 
 from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import BodyData
-from trl_suite.bodies.planar import (
-    breaks_down,
-    has_left,
-    measure,
-    observe_body,
-)
+from trl_suite.bodies.planar import breaks_down, has_left, measure, observe_body
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import CONTROL_TIMESTEP, gaits

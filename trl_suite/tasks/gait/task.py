@@ -97,10 +97,7 @@ class GaitTask(Task):
     CONFIG: Any = GaitConfig
 
     def __init__(
-        self,
-        character: Character,
-        arena: PlanarArena,
-        config: GaitConfig = GaitConfig(),
+        self, character: Character, arena: PlanarArena, config: GaitConfig = GaitConfig()
     ) -> None:
         """Attaches character and gait to an arena.
 

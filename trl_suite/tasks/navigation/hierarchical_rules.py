@@ -10,12 +10,7 @@ import numpy as np
 from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
 from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, go
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
-from trl_suite.bodies.spatial import (
-    LINES,
-    breaks_down,
-    measure,
-    observe_body,
-)
+from trl_suite.bodies.spatial import LINES, breaks_down, measure, observe_body
 from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import (

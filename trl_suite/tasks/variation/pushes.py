@@ -16,7 +16,7 @@ from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Marker, Task
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
-from trl_suite.util.options import Config, Range, option
+from trl_suite.util.options import Config, Range, option, within
 
 COLOUR = (0.9, 0.2, 0.15, 1.0)
 _METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
@@ -26,25 +26,24 @@ _METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
 class PushConfig(Config):
     """Options of pushes: horizontal forces on a link, at its centre of mass."""
 
-    force: Range | None = option(None, 'force', unit='N', at_least=0, at_most=1e6)
+    force: Range | None = option(None, 'force', **within(0, 1e6, 'N'))
     speed: Range | None = option(
         None,
-        "impulse over the character's nominal mass, instead of a force: the change of velocity of a "
-        'free body',
-        unit='m/s', at_least=0, at_most=100,
-    )  # fmt: skip
-    duration: Range = option(Range(0.2, 0.2), 'duration', unit='s', at_least=0.001, at_most=1000)
+        "impulse over the character's nominal mass, instead of a force: the change of velocity of a free body",
+        **within(0, 100, 'm/s'),
+    )
+    duration: Range = option(Range(0.2, 0.2), 'duration', **within(0.001, 1000, 's'))
     interval: Range = option(
         Range(2.0, 4.0),
         'time from the end of a push, or the start of the episode, to the next push',
-        unit='s', at_least=0, at_most=1e6,
-    )  # fmt: skip
+        **within(0, 1e6, 's'),
+    )
     direction: Range = option(
         Range(-math.pi, math.pi),
         'direction, to the left of +x; planar characters are pushed along +x if its cosine is positive, '
         'otherwise along -x',
-        unit='rad', at_least=-2 * math.pi, at_most=2 * math.pi,
-    )  # fmt: skip
+        **within(-2 * math.pi, 2 * math.pi, 'rad'),
+    )
     body: str | None = option(None, 'link that is pushed; by default the root')
 
     def __post_init__(self) -> None:

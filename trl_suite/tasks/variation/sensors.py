@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.bodies.blocks import LEVELS, Block, layout
+from trl_suite.bodies.state import WHOLE, allocated
 from trl_suite.engine import World
 from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
 from trl_suite.tasks.rewards import Outcome
@@ -60,12 +61,10 @@ class SensorConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, most in (('noise', 1e6), ('bias', 1e6)):
-            given = getattr(self, name)
-            for block, value in _entries(given):
-                if not _number(value) or not 0 <= value <= most:
-                    where = f'{name}[{block!r}]' if block else name
-                    raise ValueError(f'{where} is {value!r}; expected a number from 0 to {most:g}')
+        for name in 'noise', 'bias':
+            for block, value in _entries(getattr(self, name)):
+                where = f'{name}[{block!r}]' if block else name
+                checked(where, value, float, at_least=0, at_most=1e6)
         for block, value in _entries(self.delay):
             where = f'delay[{block!r}]' if block else 'delay'
             message = f'{where} is {value!r}; expected whole numbers of steps up to {MOST_DELAY}'
@@ -86,9 +85,9 @@ class SensorState(NamedTuple):
       noise: current noise of each number, (n, size); 1 for a flag that is wrong.
       missing: whether a number is missing at present, (n, size).
       delay: age of each number, (n, size) steps.
-      head: place of the current observation in the history, (n,).
       history: exact observations of the last steps, (n, depth, size); depth 0 without delay.
       stream: random stream, see `trl_suite.util.random.Streams`, (n, 6).
+      head: place of the current observation in the history, (n,).
     """
 
     observation: np.ndarray
@@ -96,9 +95,9 @@ class SensorState(NamedTuple):
     noise: np.ndarray
     missing: np.ndarray
     delay: np.ndarray
-    head: np.ndarray
     history: np.ndarray
     stream: np.ndarray
+    head: np.ndarray = WHOLE
 
 
 class SensorRules(NamedTuple):
@@ -156,15 +155,17 @@ def rules(
             dropout[part] = _at(config.preset, TERRAIN_DROPOUT) if given is None else given
             shared[0, part.start + 1 : part.stop] = True
     depth = int(delay.max()) + 1 if delay.any() else 0
-    state = SensorState(
-        observation=np.zeros((n, size)),
-        bias=np.zeros((n, size)),
-        noise=np.zeros((n, size)),
-        missing=np.zeros((n, size), bool),
-        delay=np.zeros((n, size), int),
-        head=np.zeros(n, int),
-        history=np.zeros((n, depth, size)),
-        stream=np.zeros((n, 6), np.uint64),
+    numbers = np.zeros(size)
+    state = allocated(
+        SensorState,
+        n,
+        observation=numbers,
+        bias=numbers,
+        noise=numbers,
+        missing=np.zeros(size, bool),
+        delay=np.zeros(size, int),
+        history=np.zeros((depth, size)),
+        stream=np.zeros(6, np.uint64),
     )
     return SensorRules(exact, noise, bias, wrong, dropout, shared, delay, state)
 
@@ -202,10 +203,6 @@ def _entries(value: Any) -> list[tuple[str, Any]]:
     if value is None:
         return []
     return list(value.items()) if isinstance(value, Mapping) else [('', value)]
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 def _of(given: Any, name: str, default: Any, flags: bool) -> Any:

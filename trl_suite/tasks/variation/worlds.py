@@ -19,7 +19,7 @@ from trl_suite.tasks.component import WORLD, Component, spawned
 from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.variation.pushes import PushConfig
-from trl_suite.util.options import Config, Range, option
+from trl_suite.util.options import Config, Range, option, within
 
 # Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
 # robots are trained: friction 0.5 to 1.25 and changes of velocity of up to 1 m/s every 15 s in
@@ -54,64 +54,55 @@ class WorldConfig(Config):
 
     preset: str | None = option(None, 'preset that the other options change', choices=PRESETS)
     friction: Range | None = option(
-        None, 'coefficient of sliding friction of all contacts; 0.81 otherwise', at_least=0, at_most=10
-    )  # fmt: skip
+        None, 'coefficient of sliding friction of all contacts; 0.81 otherwise', **within(0, 10)
+    )
     mass: Range | None = option(
-        None, 'factor of mass and inertia of all links', at_least=0.01, at_most=100
+        None, 'factor of mass and inertia of all links', **within(0.01, 100)
     )
     link_mass: Range | None = option(
         None,
         'factor of mass and inertia, drawn for each link; in addition to mass',
-        at_least=0.01,
-        at_most=100,
+        **within(0.01, 100),
     )
     inertia: Range | None = option(
         None,
         'factor of the inertia of all links about their centres of mass; in addition to mass',
-        at_least=0.01,
-        at_most=100,
+        **within(0.01, 100),
     )
     com_offset: Range | None = option(
         None,
         "displacement of the root link's centre of mass, in a random direction",
-        unit='m',
-        at_least=0,
-        at_most=1,
+        **within(0, 1, 'm'),
     )
     damping: Range | None = option(
         None,
         'factor of the passive damping of joints; the joints of gaits have none',
-        at_least=0,
-        at_most=1000,
+        **within(0, 1000),
     )
     gravity: Range | None = option(
-        None, 'magnitude of gravity; 9.8 otherwise', unit='m/s^2', at_least=0, at_most=100
+        None, 'magnitude of gravity; 9.8 otherwise', **within(0, 100, 'm/s^2')
     )
     slope: Range | None = option(
         None,
         'angle by which the whole ground is tilted: gravity is rotated, and positions, headings and heights '
         'are relative to the ground',
-        unit='rad', at_least=-1.5, at_most=1.5,
-    )  # fmt: skip
+        **within(-1.5, 1.5, 'rad'),
+    )
     slope_direction: Range | None = option(
         None,
         'direction of ascent of the slope, to the left of +x, in three dimensions; by default 0',
-        unit='rad',
-        at_least=-2 * math.pi,
-        at_most=2 * math.pi,
+        **within(-2 * math.pi, 2 * math.pi, 'rad'),
     )
     contact_depth: Range | None = option(
         None,
         'depth over which contacts become stiff, starting from nothing; otherwise they are stiff from the '
         'first touch',
-        unit='m', at_least=1e-4, at_most=0.1,
-    )  # fmt: skip
+        **within(1e-4, 0.1, 'm'),
+    )
     contact_time: Range | None = option(
         None,
         'time constant of contacts; 0.005 otherwise, and at least two physics steps',
-        unit='s',
-        at_least=1e-3,
-        at_most=1,
+        **within(1e-3, 1, 's'),
     )
     push: PushConfig | None = option(
         None, 'forces on the character: a mapping of options of pushes'
@@ -207,10 +198,8 @@ class Worlds(Component):
 
     def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
         for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-            draw(
-                env_id, self._config, np.random.default_rng(spawned(seed, WORLD)), self._spatial,
-                self.variation.properties,
-            )  # fmt: skip
+            random = np.random.default_rng(spawned(seed, WORLD))
+            draw(env_id, self._config, random, self._spatial, self.variation.properties)
             self.variation.apply(env_id)
 
     def restored(self, env_id: int) -> None:
