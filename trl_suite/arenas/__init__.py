@@ -2,3 +2,5 @@
 
 from trl_suite.arenas.planar import PlanarArena
 from trl_suite.arenas.spatial import SpatialArena
+
+__all__ = ('PlanarArena', 'SpatialArena')

@@ -16,3 +16,23 @@ from trl_suite.motion.steps import load as load_steps
 from trl_suite.motion.steps import names as steps_names
 
 Steps = FootstepLibrary  # as programs of users may call it
+
+__all__ = [
+    'DOG3D',
+    'HUMANOID3D',
+    'Capture',
+    'Clip',
+    'FootstepLibrary',
+    'Layout',
+    'Mirror',
+    'load',
+    'load_steps',
+    'names',
+    'read_amc',
+    'read_bvh',
+    'read_deepmimic',
+    'read_terrainrl',
+    'step_features',
+    'steps_names',
+    'write_terrainrl',
+]

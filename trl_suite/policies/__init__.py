@@ -12,3 +12,19 @@ from trl_suite.policies.files import (
     trained_for,
 )
 from trl_suite.policies.network import ACTIVATIONS, Policy, ensemble, placed
+
+__all__ = [
+    'ACTIVATIONS',
+    'SHARED',
+    'VARIANTS',
+    'Convolution',
+    'Policy',
+    'available',
+    'ensemble',
+    'load',
+    'placed',
+    'preference_for',
+    'reference',
+    'save',
+    'trained_for',
+]

@@ -26,3 +26,27 @@ from trl_suite.rendering.pictures import (
     spread,
 )
 from trl_suite.rendering.video import CONTROL_FPS, VIDEO_SUFFIXES, Video, video
+
+__all__ = [
+    'CONTROL_FPS',
+    'IMAGE_SUFFIXES',
+    'REPLAY_SUFFIXES',
+    'STRIP_MARGIN',
+    'VIDEO_SUFFIXES',
+    'Policy',
+    'Video',
+    'calling_each_frame',
+    'check_gl',
+    'check_options',
+    'film_strip',
+    'frame',
+    'frames',
+    'has_display',
+    'height_map',
+    'no_gl',
+    'played',
+    'plot_terrain',
+    'replay',
+    'spread',
+    'video',
+]

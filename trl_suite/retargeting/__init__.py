@@ -10,3 +10,5 @@ environment = suite.build('biped2d_full', clip=clip)
 from trl_suite.retargeting.cycles import cycle
 from trl_suite.retargeting.reading import FORMATS, read
 from trl_suite.retargeting.transfer import NAMES, counterparts, guess_map, retarget
+
+__all__ = ['FORMATS', 'NAMES', 'counterparts', 'cycle', 'guess_map', 'read', 'retarget']

@@ -14,3 +14,8 @@ others, below 2**32, for tests: `train_seeds` and `test_seeds` never overlap.
 from trl_suite.runs.course import EPISODES, FIRST_TEST_SEED, Course, test_seeds, train_seeds
 from trl_suite.runs.running import Benchmark, Learner, Resumable
 from trl_suite.runs.stage import BudgetExceededError, Stage
+
+__all__ = [
+    'EPISODES', 'FIRST_TEST_SEED', 'Benchmark', 'BudgetExceededError', 'Course', 'Learner',
+    'Resumable', 'Stage', 'test_seeds', 'train_seeds',
+]  # fmt: skip

@@ -34,3 +34,36 @@ from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
 from trl_suite.terrain.spatial.surroundings import Surroundings, capacity
+
+__all__ = [
+    'GENERATORS',
+    'GENERATORS3D',
+    'GRID',
+    'IDLE',
+    'PRESETS',
+    'PRESETS3D',
+    'SPACING',
+    'WRITTEN',
+    'Belts',
+    'Boxes',
+    'Grid',
+    'Layout',
+    'Movers',
+    'Parameter',
+    'PlanarGround',
+    'Profile',
+    'SpatialGround',
+    'Surroundings',
+    'Terrain',
+    'boxes',
+    'capacity',
+    'from_function',
+    'from_heights',
+    'from_image',
+    'from_mesh',
+    'load',
+    'register',
+    'register3d',
+    'save_mesh',
+    'to_mesh',
+]
