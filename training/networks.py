@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from trl_suite import characters, policies
+from trl_suite import policies
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util import machine
 
@@ -173,7 +173,7 @@ def described(environments: Any, seed: int, samples: int) -> dict[str, Any]:
     """Returns what a policy file says of its environment and its training."""
     action_map = environments.action_map
     info = {'seed': seed, 'samples': samples, **machine.made_with()}
-    info['character'] = characters.fingerprint(environments.task.character.spec)
+    info['character'] = environments.task.character.spec.digest
     return {
         'id': environments.spec.id,
         'blocks': tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),

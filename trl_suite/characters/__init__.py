@@ -7,7 +7,6 @@ from trl_suite.characters.character import (
     CharacterSpec,
     Joint,
     body_figures,
-    fingerprint,
 )
 from trl_suite.characters.from_file import from_file
 from trl_suite.characters.specs import CHARACTERS
@@ -19,7 +18,6 @@ __all__ = (
     'CharacterSpec',
     'Joint',
     'body_figures',
-    'fingerprint',
     'from_file',
     'make',
 )

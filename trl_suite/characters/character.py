@@ -15,8 +15,8 @@ from trl_suite.util import errors, resources
 from trl_suite.util.options import checked
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
-DIGITS = 6  # decimals of the values in a fingerprint
-# The fields of a model whose values are in a fingerprint.
+DIGITS = 6  # decimals of the values in a digest
+# The fields of a model whose values are in a digest.
 _OF_BODIES = (
     *('body_mass', 'body_inertia', 'body_ipos', 'body_pos', 'body_quat'),
     *('jnt_type', 'jnt_pos', 'jnt_axis', 'jnt_range', 'jnt_actfrcrange'),
@@ -123,7 +123,10 @@ class CharacterSpec:
 
     @functools.cached_property
     def digest(self) -> str:
-        """See `fingerprint`; it compiles the character."""
+        """Name and digest of all physical properties, gains included; compiles the character.
+
+        Independent of visual properties and of the formatting of the MJCF.
+        """
         model = mjcf.Physics.from_mjcf_model(Character(self).mjcf_model).model
         figures: list[Any] = [getattr(model, name) for name in _OF_BODIES]
         figures += [getattr(model, name)[_solid(self, model)] for name in _OF_GEOMS]
@@ -241,14 +244,6 @@ class Character(composer.Entity):
                 f'{name!r}'
             )
         return element
-
-
-def fingerprint(spec: CharacterSpec) -> str:
-    """Returns name and digest of all physical properties of a character, gains included.
-
-    Independent of visual properties and of the formatting of the MJCF. Cached per spec.
-    """
-    return spec.digest
 
 
 def body_figures(character: Character) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import characters, policies
+from trl_suite import policies
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.characters import CharacterSpec
 
@@ -55,7 +55,7 @@ class Controller:
             return
         self.policy.check(types.SimpleNamespace(blocks=blocks, action_map=action_map))
         trained = self.policy.info.get('character')
-        own = characters.fingerprint(character)
+        own = character.digest
         if trained is not None and trained != own:
             warnings.warn(
                 f'controller {self.name} was trained with body {trained}; this one is {own}',
