@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import own_test
 from absl.testing import absltest, parameterized
+from helpers import write_terrainrl
 from PIL import Image
 from programs import GAPS, CommandTest, run
 
@@ -224,7 +225,7 @@ class ActingTest(parameterized.TestCase):
 class ClipTest(CommandTest):
     def setUp(self):
         super().setUp()
-        motion.write_terrainrl(motion.load('raptor_run_050'), 'run.json')
+        write_terrainrl(motion.load('raptor_run_050'), 'run.json')
 
     def test_reads_checks_and_writes(self):
         out = self.output(

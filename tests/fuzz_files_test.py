@@ -28,6 +28,7 @@ import policies_test
 import pytest
 from absl.testing import parameterized
 from dm_control import mjcf
+from helpers import write_terrainrl
 from hypothesis import strategies as st
 
 from trl_suite import characters, motion, policies, retargeting, sequences, terrain
@@ -304,7 +305,7 @@ def files(folder):
     own_clip_test.write_bvh(figure, bvh)
     own_clip_test.write_acclaim(figure, asf, amc)
     walk = motion.load('biped2d_walk')
-    motion.write_terrainrl(walk, folder / 'walk.txt')
+    write_terrainrl(walk, folder / 'walk.txt')
     walk.save(folder / 'walk.npz')
     steps = motion.load_steps('biped3d_mocap')
     few = {name: getattr(steps, name)[:3] for name in ('poses', 'labels', 'previous', 'features')}

@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import json
 import os
 import pathlib
 import pickle
@@ -151,6 +152,24 @@ def put(environment, pose, rate):
     task, data = environment.task, environment.physics.data
     data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
     environment.physics.forward()
+
+
+def write_terrainrl(clip, path):
+    """Writes a clip as a motion file of TerrainRL: x forward, y up, z to the right."""
+    head = 3 if clip.root == 'planar' else 7
+    durations = np.append(np.diff(clip.times), 0.0)
+    frames = np.zeros((len(durations), 8 + sum(clip.sizes)))
+    frames[:, 0], frames[:, 8:] = durations, clip.poses[:, head:]
+    if clip.root == 'planar':
+        x, z, pitch = clip.poses[:, :3].T
+        frames[:, [1, 2, 4, 7]] = np.stack([x, z, np.cos(pitch / 2), np.sin(pitch / 2)], axis=1)
+    else:
+        frames[:, 1:4], frames[:, 4:8] = clip.poses[:, [0, 2, 1]] * (1, 1, -1), clip.poses[:, 3:7]
+    for column, _ in clip.layout.rotations:
+        here = slice(column + 8 - head, column + 12 - head)
+        frames[:, here] = frames[:, here][:, [0, 1, 3, 2]] * (1, 1, 1, -1)
+    content = {'Loop': clip.loop, 'Frames': frames.tolist()}
+    pathlib.Path(path).write_text(json.dumps(content))
 
 
 def angle_between(a, b):

@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import FolderTest, assert_refused
+from helpers import FolderTest, assert_refused, write_terrainrl
 from scipy.spatial.transform import Rotation
 
 from trl_suite import motion
@@ -415,7 +415,7 @@ class ReaderTest(FolderTest):
     @parameterized.product(make=(planar, free), loop=(True, False))
     def test_round_trip(self, make, loop):
         clip = make(loop=loop)
-        motion.write_terrainrl(clip, self.path)
+        write_terrainrl(clip, self.path)
         found = motion.read_terrainrl(self.path, clip.joints, clip.sizes, clip.root)
         np.testing.assert_allclose(found.times, clip.times, atol=1e-12)
         np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)

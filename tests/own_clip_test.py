@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import FolderTest, assert_refused
+from helpers import FolderTest, assert_refused, write_terrainrl
 from scipy.spatial.transform import Rotation
 
 from trl_suite import motion, retargeting, suite
@@ -243,7 +243,7 @@ class ReadingTest(ClipTest):
 
     def test_the_two_kinds_of_json(self):
         clip = motion.load('biped2d_walk')
-        motion.write_terrainrl(clip, self.folder / 'terrainrl.json')
+        write_terrainrl(clip, self.folder / 'terrainrl.json')
         found = retargeting.read(self.folder / 'terrainrl.json', 'biped2d')
         np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
         self.assertTrue(found.loop)
@@ -286,7 +286,7 @@ class ReadingTest(ClipTest):
             found = retargeting.read(path.rename(self.folder / 'walk.txt'), PLAIN, skeleton)
             np.testing.assert_array_equal(found.rotations, expected.rotations)
         clip = motion.load('biped2d_walk')
-        for write in (clip.save, lambda path: motion.write_terrainrl(clip, path)):
+        for write in (clip.save, lambda path: write_terrainrl(clip, path)):
             write(self.folder / 'walk.txt')
             found = retargeting.read(self.folder / 'walk.txt', 'biped2d')
             np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)

@@ -3,13 +3,7 @@
 from trl_suite.motion.capture import Capture, read_amc, read_bvh
 from trl_suite.motion.clip import Clip, load, names
 from trl_suite.motion.layout import Layout, Mirror
-from trl_suite.motion.readers import (
-    DOG3D,
-    HUMANOID3D,
-    read_deepmimic,
-    read_terrainrl,
-    write_terrainrl,
-)
+from trl_suite.motion.readers import DOG3D, HUMANOID3D, read_deepmimic, read_terrainrl
 from trl_suite.motion.steps import FootstepLibrary
 from trl_suite.motion.steps import features as step_features
 from trl_suite.motion.steps import load as load_steps
@@ -34,5 +28,4 @@ __all__ = [
     'read_terrainrl',
     'step_features',
     'steps_names',
-    'write_terrainrl',
 ]

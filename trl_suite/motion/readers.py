@@ -1,4 +1,4 @@
-"""Reading and writing the JSON motion files of Terrain RL Simulator and DeepMimic.
+"""Readers of the JSON motion files of Terrain RL Simulator and DeepMimic.
 
 Both hold `Frames`, arrays of [duration of the frame in s, root x, y, z, root quaternion wxyz, then
 one number per hinge and a quaternion wxyz per ball joint, in the order of the character file]. They
@@ -15,7 +15,6 @@ about (0, -1, 0), which is the same axis.
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +25,7 @@ import numpy as np
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
 from trl_suite.util import errors
-from trl_suite.util.files import read_json, replacing
+from trl_suite.util.files import read_json
 from trl_suite.util.options import checked
 
 # Numbers of a frame before the joints, and those of DeepTerrainRL.
@@ -152,33 +151,6 @@ def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
     return known[length]
 
 
-def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
-    """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged.
-
-    The format cannot express an accumulating heading: the file of a turning clip has one cycle.
-    """
-    durations = np.append(np.diff(clip.times), 0.0)
-    n = len(clip.times)
-    frames = np.zeros((n, _HEADER + sum(clip.sizes)))
-    frames[:, 0] = durations
-    if clip.root == 'planar':
-        frames[:, [1, 2]] = clip.poses[:, :2]
-        frames[:, 4] = np.cos(clip.poses[:, 2] / 2)
-        frames[:, 7] = np.sin(clip.poses[:, 2] / 2)
-    else:
-        x, y, z = clip.poses[:, :3].T
-        frames[:, 1:4] = np.stack([x, z, -y], axis=1)
-        frames[:, 4:8] = _upright(clip.poses[:, 3:7])
-    frames[:, _HEADER:] = clip.poses[:, 3 if clip.root == 'planar' else 7 :]
-    for column in _balls(clip.sizes):
-        here = slice(column, column + 4)
-        frames[:, here] = _upright(frames[:, here])
-    rows = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
-    text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{rows}\n]\n}}\n'
-    with replacing(pathlib.Path(path)) as part:
-        part.write_text(text)
-
-
 def _parse(path: pathlib.Path) -> dict[str, Any]:
     motion = read_json(path)
     if not isinstance(motion, dict):
@@ -247,11 +219,6 @@ def _balls(sizes: Sequence[int]) -> Iterator[int]:
         if size == 4:
             yield column
         column += size
-
-
-def _upright(q: np.ndarray) -> np.ndarray:
-    """Converts quaternions to the files' frame: (x, y, z) -> (x, z, -y)."""
-    return q[:, [0, 1, 3, 2]] * np.array([1, 1, 1, -1])
 
 
 def _lying(q: np.ndarray) -> np.ndarray:
