@@ -91,7 +91,6 @@ class SamplingTest(parameterized.TestCase):
         for shape in ((), (3,), (2, 5), (0,)):
             self.assertEqual(clip.pose(np.zeros(shape)).shape, (*shape, 12))
             self.assertEqual(clip.velocity(np.zeros(shape)).shape, (*shape, 10))
-            self.assertEqual(clip.phase(np.zeros(shape)).shape, shape)
 
     @parameterized.parameters(-3, -1, 0, 1, 7)
     def test_displacement_accumulates_height_included(self, cycles):
@@ -179,8 +178,6 @@ class SamplingTest(parameterized.TestCase):
 
     def test_figures(self):
         clip, still = planar(), planar(loop=False)
-        np.testing.assert_allclose(clip.phase([-0.2, 0, 0.2, 0.8, 1.0]), (0.75, 0, 0.25, 0, 0.25))
-        np.testing.assert_allclose(still.phase([-1, 0.2, 1]), (0, 0.25, 1))
         np.testing.assert_allclose(still.velocity([0, PERIOD])[:, :2], [[2, 0.5]] * 2)
         np.testing.assert_allclose(clip.displacement, (1.6, 0.4))
         self.assertAlmostEqual(clip.duration, PERIOD)
@@ -355,11 +352,6 @@ class StepsTest(FolderTest):
         library = steps()
         self.assertLen(library, 2)
         self.assertEqual(library.duration, 0.5)
-        np.testing.assert_allclose(library.landing([0, 1]), [(0.5, 0.15, 0.1), (1.0, 0.2, -0.3)])
-        np.testing.assert_allclose(
-            library.landing([0, 1], [True, False]), [(0.5, -0.15, -0.1), (1.0, 0.2, -0.3)]
-        )
-        np.testing.assert_allclose(library.landing(1, True), (1.0, -0.2, 0.3))
 
     def test_features(self):
         # A walker that faces +y, at (1, 2), right foot 0.1 m to its right and 0.2 m ahead.

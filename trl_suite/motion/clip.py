@@ -196,11 +196,6 @@ class Clip:
         share = np.where(inside, 1 / np.where(inside, end - start, 1), 0)
         return poses, velocity * share[..., None]
 
-    def phase(self, t: ArrayLike) -> np.ndarray:
-        """Returns the phase at times `t`, same shape: [0, 1) looping, else clamped to [0, 1]."""
-        cycles = np.asarray(t, dtype=float) / self.duration
-        return cycles - np.floor(cycles) if self.loop else np.clip(cycles, 0, 1)
-
     def mirrored(self, pairs: Iterable[tuple[str, str]] | None = None) -> Clip:
         """Returns the clip with left and right exchanged; see `Mirror`.
 

@@ -142,11 +142,6 @@ class FootstepLibrary:
         velocity = change / (end - start)[..., None]
         return _mirrored(mirrored, velocity, self.layout.mirror.velocity)
 
-    def landing(self, index: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns labels with fixed directions: forward m, to the left m, turn to the left rad."""
-        sign = np.where(mirrored, -1, 1)[..., None]
-        return self.labels[np.asarray(index)] * np.where([False, True, True], sign, 1)
-
     def select(self, query: np.ndarray, weights: ArrayLike = WEIGHTS) -> np.ndarray:
         """Returns the clip nearest to each query.
 
