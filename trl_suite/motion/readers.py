@@ -17,13 +17,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite.motion.clip import Clip
-from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
+from trl_suite.motion.layout import LARGEST, SHORTEST, Layout
 from trl_suite.util import errors
 from trl_suite.util.files import read_json
 from trl_suite.util.options import checked
@@ -212,20 +212,6 @@ def _field(
     return f'column {column}'
 
 
-def _balls(sizes: Sequence[int]) -> Iterator[int]:
-    """Yields the first column of every ball joint of a frame."""
-    column = _HEADER
-    for size in sizes:
-        if size == 4:
-            yield column
-        column += size
-
-
-def _lying(q: np.ndarray) -> np.ndarray:
-    """Converts quaternions from the files' frame: (x, y, z) -> (x, -z, y)."""
-    return q[:, [0, 1, 3, 2]] * np.array([1, 1, -1, 1])
-
-
 def _clip(
     path: pathlib.Path,
     frames: np.ndarray,
@@ -234,39 +220,33 @@ def _clip(
     root: str,
     loop: bool,
 ) -> Clip:
-    """Returns frames of a file as a clip."""
-    joints, sizes = tuple(joints), tuple(sizes)
-    if len(joints) != len(sizes) or not set(sizes) <= set(JOINT_SIZES):
-        raise ValueError(f'{len(joints)} joints with sizes {sizes}: one of {JOINT_SIZES} is needed')
-    length = _HEADER + sum(sizes)
-    if frames.shape[1] != length:
+    """Returns frames of a file, which hold the root in full, as a clip."""
+    layout, poses = Layout('free', joints, sizes), frames[:, 1:]
+    if poses.shape[1] != layout.columns:
         raise ValueError(
             f'{path}: frame 0 has {frames.shape[1]} numbers, the layout of {len(joints)} joints '
-            f'needs {length}'
+            f'needs {1 + layout.columns}'
         )
-    for column in (4, *_balls(sizes)):
+    # (x, y, z) -> (x, -z, y)
+    poses[:, :3] = poses[:, [0, 2, 1]] * (1, -1, 1)
+    for column, _ in layout.rotations:
         here = slice(column, column + 4)
-        norms = np.linalg.norm(frames[:, here], axis=1)
+        norms = np.linalg.norm(poses[:, here], axis=1)
         for i in np.flatnonzero(norms < _ZERO):
-            field = _field(column, joints, sizes)
+            field = _field(column + 1, layout.joints, layout.sizes)
             raise ValueError(f'{path}: frame {i}, {field}: the quaternion is zero')
-        frames[:, here] /= norms[:, None]
-    times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
-    balls = list(_balls(sizes))
-    for column in balls:
-        frames[:, column : column + 4] = _lying(frames[:, column : column + 4])
+        poses[:, here] = (poses[:, here] / norms[:, None])[:, [0, 1, 3, 2]] * (1, 1, -1, 1)
     if root == 'planar':
-        position, rotation = np.abs(frames[:, 3]), np.abs(frames[:, [5, 6]]).max(axis=1)
+        turns = poses[:, 3:7]
+        position, rotation = np.abs(poses[:, 1]), np.abs(turns[:, [1, 3]]).max(axis=1)
         for field, off in (('root position', position), ('root quaternion', rotation)):
             for i in np.flatnonzero(off > _FLAT):
                 raise ValueError(f'{path}: frame {i}, {field}: leaves the plane by {off[i]:g}')
         # A quaternion and its negative are the same rotation: unwrap the full angle, not half.
-        pitch = np.unwrap(2 * np.arctan2(frames[:, 7], frames[:, 4]))
+        pitch = np.unwrap(2 * np.arctan2(-turns[:, 2], turns[:, 0]))
         pitch -= 2 * np.pi * np.round(pitch[0] / (2 * np.pi))
-        head = np.column_stack([frames[:, [1, 2]], pitch])
-    else:
-        x, y, z = frames[:, 1:4].T
-        head = np.column_stack([x, -z, y, _lying(frames[:, 4:8])])
-    poses = np.concatenate([head, frames[:, _HEADER:]], axis=1)
+        poses = np.column_stack([poses[:, [0, 2]], pitch, poses[:, 7:]])
+    times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
     with errors.naming(path):
-        return Clip(path.stem, times, poses, root, joints, sizes, loop, f'read from {path.name}')
+        kind = root, layout.joints, layout.sizes
+        return Clip(path.stem, times, poses, *kind, loop, f'read from {path.name}')
