@@ -349,46 +349,6 @@ class FilmStripTest(FolderTest):
 class SpatialTest(FolderTest):
     """What is drawn in three dimensions; footsteps_test has the markers."""
 
-    def build(self, terrain, **options):
-        environment = suite.build(
-            'biped3d', terrain=terrain,
-            task_kwargs={'random': 1, 'terrain_observation': 'height', 'start_phase': 0.0, **options},
-        )  # fmt: skip
-        environment.reset()
-        return environment
-
-    def test_height_map_is_seen_from_above(self):
-        environment = self.build('plane')
-        level = rendering.height_map(environment)
-        self.assertEqual((level.shape, level.dtype), ((256, 256, 3), np.uint8))
-        dark = np.argwhere((level < 60).all(2))
-        # The character, 1 m of 11 m from behind, in the middle.
-        self.assertBetween(dark[:, 0].mean(), 220, 240)
-        self.assertBetween(dark[:, 1].mean(), 124, 132)
-        self.assertLess(len(dark), 100)
-        light = (level > 200).all(2)
-        self.assertEqual(light.sum() + len(dark), 256 * 256)
-        # A block ahead on the left, a hole on the right: samples 32 v + u, lines v from the left.
-        part = environment.task.blocks['terrain']
-        heights = environment.task.observation[0, part].reshape(32, 32)
-        heights[2:5, 20:25], heights[28:31, 20:25] = 2.0, -2.0
-        image = rendering.height_map(environment).astype(int)
-        brown = np.argwhere(image[..., 0] - image[..., 2] > 100)
-        blue = np.argwhere(image[..., 2] - image[..., 0] > 100)
-        for found, columns in ((brown, (16, 39)), (blue, (224, 247))):
-            self.assertEqual((found[:, 1].min(), found[:, 1].max()), columns)
-            self.assertEqual((found[:, 0].min(), found[:, 0].max()), (8 * 7, 8 * 12 - 1))
-        # Half as high is half as brown where the full colour is for 4 m.
-        half = rendering.height_map(environment, reach=4.0)[60, 20].astype(int)
-        np.testing.assert_allclose(half, (level[0, 0].astype(int) + image[60, 20]) / 2, atol=1)
-
-    def test_height_map_of_a_planning_task(self):
-        environment, path = make('PD_Biped3D_HLC_Forest-v0'), self.folder / 'a.png'
-        image = rendering.height_map(environment, path, reach=1.0)
-        np.testing.assert_array_equal(iio.imread(path), image)
-        brown = (image[..., 0].astype(int) - image[..., 2] > 100).mean()
-        self.assertBetween(brown, 0.001, 0.3)  # some pillars on level ground
-
     def test_moving_boxes_have_no_ghosts(self):
         environment = suite.build(
             'biped3d_mocap', terrain='dynamic_obstacles3d', task_kwargs={'random': 1}
@@ -445,10 +405,6 @@ def plot(message, terrain='gaps', **options):
     return lambda folder: rendering.plot_terrain(terrain, folder / 'a.png', **options), message
 
 
-def heights(message, id_='PD_Biped3D_HLC_Forest-v0', name='a.png', **options):
-    return lambda folder: rendering.height_map(make(id_), folder / name, **options), message
-
-
 class ErrorsTest(FolderTest):
     @parameterized.parameters(
         frame("unknown camera 'sid'; did you mean 'side'", camera='sid'),
@@ -479,10 +435,6 @@ class ErrorsTest(FolderTest):
         plot('length is 301; expected a number above 0 and at most 300, in m', 'plane', length=301),
         plot('seed is -1', seed=-1),
         plot('terrain_level is .*; expected a number', terrain_level=float('nan')),
-        heights('the task PlanarImitation.*no map', GAPS),
-        heights("terrain_observation='height'", 'PD_Biped3D_Imitate-v0'),
-        heights('reach is 0', reach=0),
-        heights("suffix '.gif'", name='a.gif'),
     )  # fmt: skip
     def test_errors_leave_no_files(self, call, message):
         with self.assertRaisesRegex((ValueError, FileNotFoundError), message):

@@ -1,4 +1,4 @@
-"""Rendering without a display: frames, videos, film strips, plots of terrain, height maps.
+"""Rendering without a display: frames, videos, film strips, plots of terrain.
 
 Whatever writes a file raises an ImportError if the extra that it needs is not installed, 'video' or
 for replays 'viewer', and an OSError if the file cannot be written.
@@ -21,7 +21,6 @@ from trl_suite.rendering.pictures import (
     REPLAY_SUFFIXES,
     STRIP_MARGIN,
     film_strip,
-    height_map,
     plot_terrain,
     spread,
 )
@@ -42,7 +41,6 @@ __all__ = [
     'frame',
     'frames',
     'has_display',
-    'height_map',
     'no_gl',
     'played',
     'plot_terrain',

@@ -1,4 +1,4 @@
-"""Pictures made without OpenGL: film strips, plots of terrain, height maps.
+"""Pictures made without OpenGL: film strips and plots of terrain.
 
 `trl_suite.rendering` also exports these names. A file appears under its name only when it is
 complete. PNG files and plots need `pip install 'trl_suite[video]'`.
@@ -7,25 +7,18 @@ complete. PNG files and plots need `pip install 'trl_suite[video]'`.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import tqdm
 
 from trl_suite import terrain as terrains
 from trl_suite.rendering.video import check_image
-from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
 from trl_suite.util.options import checked
 
-if TYPE_CHECKING:  # plots of terrain need no engine
-    from dm_control import composer
-
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
-MAP_PIXELS = 8  # of each sample of a height map, along both axes
-HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
-ROOT_COLOUR = (20, 20, 20)  # at the character's position on its height map
 MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
 MOST_DRAWS = 100  # in one plot
 MAP_POINTS = 400  # largest number of points along each axis of such a plot
@@ -61,7 +54,9 @@ def film_strip(
     parts = [part for i in chosen for part in (margin, images[i])]
     strip = np.concatenate(parts[1:], axis=1)
     if path is not None:
-        _write_png(strip, path)
+        picture = library('PIL.Image', 'trl_suite[video]').fromarray(strip)
+        with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
+            picture.save(part)
     return strip
 
 
@@ -183,55 +178,3 @@ def _plot_maps(
     panels[0].set_ylabel('y (m)')
     figure.suptitle(f'{terrain.name} ({terrain.type})')
     figure.colorbar(image, ax=list(panels), label='z (m)')
-
-
-def height_map(
-    environment: composer.Environment, path: Path | None = None, reach: float = 1.0
-) -> np.ndarray:
-    """Draws the 32 x 32 heights that a character observes, from above.
-
-    Ahead is up, the character's left is left; a dark square marks its position. Ground as high as
-    that under the character is light; brown is higher, blue lower. Mirrored observations are drawn
-    mirrored.
-
-    Args:
-      environment: one whose task observes such a map (`terrain_observation='height'`), after
-        `reset`.
-      path: .png file to write; None for none.
-      reach: height difference at which colours are saturated, m.
-
-    Returns:
-      The picture, shape (256, 256, 3), uint8.
-
-    Raises:
-      ValueError: the task does not observe such a map, reach is not positive, or another suffix.
-    """
-    task: Any = environment.task
-    part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
-    if part.stop - part.start != SAMPLES**2:
-        raise ValueError(
-            f'the task {type(task).__name__} observes no map of {SAMPLES} x {SAMPLES} heights; '
-            "3D imitation and footsteps observe one with the option terrain_observation='height'"
-        )
-    checked('reach', reach, float, 'm', above=0)
-    # Lines are ordered from the left, samples of a line from behind.
-    heights = task.observation[0, part].reshape(SAMPLES, SAMPLES).T[::-1]
-    share = np.clip(heights / reach, -1, 1)[..., None]
-    full = np.where(share < 0, np.array(LOWER, float), np.array(HIGHER, float))
-    colours = np.array(LEVEL) + np.abs(share) * (full - np.array(LEVEL))
-    image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
-    # A sample is at the centre of its square.
-    behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
-    middle = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
-    column = round(0.5 * SAMPLES * MAP_PIXELS)
-    mark = MAP_PIXELS // 2
-    image[middle - mark : middle + mark, column - mark : column + mark] = ROOT_COLOUR
-    if path is not None:
-        _write_png(image, path)
-    return image
-
-
-def _write_png(image: np.ndarray, path: Path) -> None:
-    picture = library('PIL.Image', 'trl_suite[video]').fromarray(image)
-    with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
-        picture.save(part)
