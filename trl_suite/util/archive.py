@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import math
 import os
 import pathlib
+import zipfile
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from trl_suite.util.files import load_arrays, replacing
+from trl_suite.util.files import check_size, read_bytes, replacing
+
+MOST_EMPTY = 10**6  # elements of an array without content
 
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
@@ -38,9 +43,20 @@ def arrays(path: pathlib.Path, what: str) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     field = ''
     try:
-        archive = load_arrays(path)
-        for field in archive.files:
-            found[field] = archive[field]
+        content = io.BytesIO(read_bytes(path))
+        with zipfile.ZipFile(content) as entries:
+            check_size(path, size=sum(entry.file_size for entry in entries.infolist()))
+        content.seek(0)
+        with np.load(content, allow_pickle=False) as archive:
+            for field in archive.files:
+                found[field] = array = archive[field]
+                if not isinstance(array, np.ndarray):
+                    raise ValueError('is not an array')
+                # Lists of more elements than bytes would take all memory.
+                if math.prod(max(n, 1) for n in array.shape) > max(array.nbytes, MOST_EMPTY):
+                    raise ValueError(
+                        f'has shape {array.shape}, of type {array.dtype} without content'
+                    )
     except FileNotFoundError:
         raise
     except Exception as error:  # a corrupt archive raises many types of exceptions

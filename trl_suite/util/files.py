@@ -6,23 +6,18 @@ import contextlib
 import difflib
 import io
 import json
-import math
 import os
 import pathlib
 import secrets
 import stat
-import zipfile
 from collections.abc import Callable, Iterator
 from typing import Any
-
-import numpy as np
 
 from trl_suite.util.libraries import optional
 
 fcntl = optional('fcntl')  # Windows has none
 Path = str | os.PathLike[str]
 LARGEST = 2**28  # bytes of a file, or of the arrays of an archive, 268 MB
-MOST_EMPTY = 10**6  # elements of an array without content
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
@@ -122,32 +117,6 @@ def read_bytes(path: Path, largest: int = LARGEST) -> bytes:
     if len(content) > size:  # as of those in /proc
         raise ValueError(f'{path}: has more than its size; expected a regular file')
     return content
-
-
-class Arrays(np.lib.npyio.NpzFile):
-    """An open archive; an array is read, and checked, when it is taken out by its name."""
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """Returns an array, unless it has more elements than bytes, whose lists would take all memory."""
-        array = super().__getitem__(name)
-        if not isinstance(array, np.ndarray):
-            raise ValueError('is not an array')
-        if math.prod(max(n, 1) for n in array.shape) > max(array.nbytes, MOST_EMPTY):
-            raise ValueError(f'has shape {array.shape}, of type {array.dtype} without content')
-        return array
-
-
-def load_arrays(path: Path) -> Arrays:
-    """Opens an archive of arrays (.npz) without pickled objects."""
-    content = io.BytesIO(read_bytes(path))
-    try:
-        with zipfile.ZipFile(content) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-    except zipfile.BadZipFile as error:
-        raise ValueError(f'{path}: not an archive of arrays (.npz): {error}') from None
-    check_size(path, size=size)
-    content.seek(0)
-    return Arrays(content, allow_pickle=False)
 
 
 def read_text(path: Path) -> str:
