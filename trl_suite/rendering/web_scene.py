@@ -8,6 +8,7 @@ episode here, and the first body that moves need not be the character.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -275,11 +276,9 @@ def _sky(model: Any) -> np.ndarray | None:
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     if not len(skies):
         return None
-    texture = model.tex(int(skies[0]))
-    size, channels = int(texture.width[0]), int(texture.nchannel[0])
-    start = int(texture.adr[0]) + FRONT * size * size * channels
-    face = model.tex_data[start : start + size * size * channels].reshape(size, size, channels)
-    column = face[: size // 2, :1, :3]
+    pixels = _pixels(model, skies[0])
+    size = pixels.shape[1]
+    column = pixels[FRONT * size : FRONT * size + size // 2, :1]
     return np.concatenate([column, np.repeat(column[-1:], size // 2, axis=0)])
 
 
@@ -289,12 +288,15 @@ def _material_colours(model: Any) -> np.ndarray:
     colours[:-1] = model.mat_rgba
     textures = model.mat_texid[:, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
     for i in np.flatnonzero(textures >= 0):
-        texture = model.tex(int(textures[i]))
-        start, channels = int(texture.adr[0]), int(texture.nchannel[0])
-        count = int(texture.width[0] * texture.height[0]) * channels
-        pixels = model.tex_data[start : start + count].reshape(-1, channels)
-        colours[i, :3] *= pixels[:, :3].mean(0) / 255
+        colours[i, :3] *= _pixels(model, textures[i]).mean((0, 1)) / 255
     return colours
+
+
+def _pixels(model: Any, texture: int) -> np.ndarray:
+    """Returns the red, green and blue of a texture, (height, width, 3) uint8."""
+    shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
+    start = model.tex_adr[texture]
+    return model.tex_data[start : start + math.prod(shape)].reshape(shape)[..., :3]
 
 
 def _quaternions(axes: np.ndarray) -> np.ndarray:

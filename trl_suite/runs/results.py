@@ -108,10 +108,8 @@ class Format:
           OSError: the file cannot be read.
         """
         result = files.read_json(files.existing(path, ('.json',)))
-        try:
+        with errors.naming(path):
             self.check(result, complete)
-        except ValueError as error:
-            raise ValueError(f'{path}: {error}') from None
         return result
 
     def check(self, result: Any, complete: bool = True) -> None:
