@@ -1,4 +1,4 @@
-"""The command line: `trl-suite NAME` is the function `run` of the module `trl_suite.cli.NAME`."""
+"""The command line; each module declares and runs its command, `trl_suite.cli.runs` two of them."""
 
 from trl_suite.cli.main import main
 

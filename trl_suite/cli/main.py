@@ -20,7 +20,7 @@
     trl-suite sequences check result.json
 
 Invalid input ends with one line on stderr and exit status 2. Each module of `COMMANDS` declares the
-arguments of its command, and runs it; the engine is imported only when a command that needs it runs.
+arguments of its commands, and runs them; the engine is imported only when a command that needs it runs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import trl_suite
 from trl_suite.util import program
 
 # In the order of the help.
-COMMANDS = 'list info rollout view evaluate dataset terrain clip try_file doctor compile bench benchmark sequences'
+COMMANDS = 'list info rollout view evaluate dataset terrain clip try_file doctor compile bench runs'
 
 
 def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:

@@ -1,0 +1,193 @@
+"""`trl-suite benchmark` and `trl-suite sequences`: run learners; check, compare and verify results."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import pathlib
+import sys
+from typing import Any
+
+from trl_suite.cli import engine
+from trl_suite.cli.arguments import add_command, add_file, add_threads, positive
+from trl_suite.util import errors, files, program
+
+
+def declare(commands: Any) -> None:
+    """Declares the commands, their actions, and their arguments."""
+    text = 'list the environments, with the scores that are 0 and 1'
+    actions = _add(commands, 'benchmark', 'benchmark of learning algorithms', text, _list)
+    text = 'train a learner on environments of the core set, and test it after every 5 %%'
+    command = _add_run(actions, text, _run, '1M', '10M')
+    text = 'environment of the core set; by default all, one after the other'
+    command.add_argument('ids', nargs='*', metavar='ID', help=text)
+    text = 'folder of the results, by default the name of the learner; unfinished runs are resumed'
+    command.add_argument('--output', type=pathlib.Path, metavar='FOLDER', help=text)
+    command = add_command(actions, 'report', 'compare learners by their results', _report)
+    _add_results(command)
+    add_file(command, '--json', 'write the numbers, .json', '.json')
+    text = 'check results, and repeat their last tests with the policies beside them'
+    command = add_command(actions, 'verify', text, _verify)
+    _add_results(command)
+    add_threads(command)
+
+    text = 'benchmark of continual learning'
+    actions = _add(commands, 'sequences', text, 'list the sequences', _list_sequences)
+    text = 'train a learner on a sequence, and test it after each stage'
+    command = _add_run(actions, text, _run_sequence, 'small', 'full')
+    command.add_argument('name', metavar='NAME', help='name of a sequence')
+    command.add_argument('--stages', type=positive, metavar='N', help='stop after N stages')
+    text = 'result, .json; an unfinished run is resumed'
+    command.add_argument(
+        '--output', type=pathlib.Path, default='result.json', metavar='FILE', help=text
+    )
+
+
+def _add(commands: Any, name: str, text: str, listed: str, list_: Any) -> Any:
+    """Adds a benchmark, with the actions `list` and `check`; returns its actions."""
+    actions = add_command(commands, name, text).add_subparsers(required=True, metavar='action')
+    add_command(actions, 'list', listed, list_)
+    command = add_command(actions, 'check', 'check results: fields, budget and metrics', _check)
+    command.set_defaults(benchmark=name)
+    text = 'a result, .json'
+    command.add_argument('files', nargs='+', type=pathlib.Path, metavar='FILE', help=text)
+    return actions
+
+
+def _add_run(actions: Any, text: str, run: Any, *budgets: str) -> argparse.ArgumentParser:
+    """Adds the action `run`; the first budget is the default."""
+    command = add_command(actions, 'run', text, run)
+    text = 'class of the learner: CLASS(course, seed), with the methods train(stage) and policy()'
+    command.add_argument('--learner', required=True, metavar='MODULE:CLASS', help=text)
+    text = f'samples for each environment: {", ".join(budgets)}, or N'
+    command.add_argument('--budget', default=budgets[0], help=text)
+    text = 'episodes per test and environment'
+    command.add_argument('--episodes', type=positive, default=32, help=text)
+    command.add_argument('--seed', type=int, default=0, help='seed of the run')
+    add_threads(command)
+    return command
+
+
+def _add_results(command: argparse.ArgumentParser) -> None:
+    text = 'a result, .json, or a folder of results'
+    command.add_argument('entries', nargs='+', type=pathlib.Path, metavar='ENTRY', help=text)
+
+
+def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
+    """Returns the files of results in entries, which are files or folders."""
+    paths = []
+    for entry in entries:
+        found = sorted(entry.rglob('*.json')) if entry.is_dir() else [entry]
+        if not found:
+            raise ValueError(f'{entry}: has no results; expected files ENVIRONMENT_sSEED.json')
+        paths += found
+    return paths
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    benchmark = engine.load('trl_suite.benchmark')
+    print(f'{"environment":<35} {"0":>7} {"1":>7} {"limit":>6}  what it tests')
+    for id, course in benchmark.CORE.items():
+        low, high = benchmark.ends(id)
+        limit = course.spec(id).step_limit
+        print(f'{id:<35} {low:>7.3f} {high:>7.3f} {limit:>6}  {course.description}')
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    benchmark = engine.load('trl_suite.benchmark')
+    courses = [benchmark.get(id) for id in arguments.ids or benchmark.CORE]
+    kind = _learner(arguments.learner)
+    budget = _budget(arguments.budget, benchmark.BUDGETS)
+    folder = arguments.output or pathlib.Path(arguments.learner.rpartition(':')[2])
+    folder.mkdir(exist_ok=True)
+    for course in courses:
+        path = folder / f'{course.name}_s{arguments.seed}.json'
+        result = benchmark.run(
+            course, kind(course, arguments.seed), budget, path, arguments.episodes,
+            arguments.seed, arguments.threads, progress=True,
+        )  # fmt: skip
+        print(f'{path}: score {result["metrics"]["score"]:.3f}', flush=True)
+
+
+def _list_sequences(arguments: argparse.Namespace) -> None:
+    sequences = engine.load('trl_suite.sequences')
+    for name, sequence in sequences.SEQUENCES.items():
+        print(f'{name:<18} {len(sequence)} environments: {sequence.description}')
+
+
+def _run_sequence(arguments: argparse.Namespace) -> None:
+    sequences = engine.load('trl_suite.sequences')
+    sequence = sequences.get(arguments.name)
+    kind = _learner(arguments.learner)
+    result = sequences.run(
+        sequence, kind(sequence, arguments.seed), _budget(arguments.budget, sequences.BUDGETS),
+        arguments.output, arguments.episodes, arguments.seed, arguments.threads, progress=True,
+        stages=arguments.stages,
+    )  # fmt: skip
+    for id, row in zip(sequence.ids, result['scores'], strict=False):
+        print(f'after {id:34}', *(f'{score:.3f}' for score in row))
+    for name, value in result.get('metrics', {}).items():
+        print(f'{name:40} {value:.3f}')
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Checks results, and prints one line for each."""
+    benchmark = engine.load(f'trl_suite.{arguments.benchmark}').BENCHMARK
+    for path in arguments.files:
+        result = benchmark.read(path)
+        notes = benchmark.departures(result)
+        comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
+        made = ''.join(f', {name} {result[name]}' for name in ('mujoco', 'cpu') if name in result)
+        line = (
+            f'{path}: {result["learner"]}, {result[benchmark.field]}, budget {result["budget"]}, '
+            f'seed {result["seed"]}{made}: {comparable}'
+        )
+        print(program.printable(line))
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    report = engine.load('trl_suite.benchmark.report')
+    benchmark = engine.load('trl_suite.benchmark')
+    results = [benchmark.read(path) for path in _results(arguments.entries)]
+    found = report.report(results)
+    print('\n'.join(map(program.printable, report.table(found).split('\n'))))
+    if arguments.json is not None:
+        files.write_json(found, arguments.json)
+
+
+def _verify(arguments: argparse.Namespace) -> None:
+    benchmark = engine.load('trl_suite.benchmark')
+    for path in _results(arguments.entries):
+        result = benchmark.verify(path, arguments.threads)
+        print(program.printable(f'{path}: verified, score {result["metrics"]["score"]:.3f}'))
+
+
+def _budget(text: str, budgets: dict[str, int]) -> int:
+    """Returns a number of samples by its name, or as it is given."""
+    try:
+        return budgets[text] if text in budgets else int(float(text))
+    except (ValueError, OverflowError):
+        raise ValueError(
+            f'--budget is {text!r}; expected {", ".join(budgets)} or a number of samples'
+        ) from None
+
+
+def _learner(text: str) -> Any:
+    """Returns a class by 'module:Class'; the current folder is searched first."""
+    module, _, name = text.partition(':')
+    if not (name and all(part.isidentifier() for part in module.split('.'))):
+        raise ValueError(f'--learner is {text!r}; expected module:Class')
+    sys.path.insert(0, os.getcwd())
+    found = importlib.import_module(module)
+    if not hasattr(found, name):
+        classes = [each for each in dir(found) if isinstance(getattr(found, each), type)]
+        raise ValueError(errors.unknown(f'learner of the module {module}:', name, classes))
+    kind = getattr(found, name)
+    lacking = [method for method in ('train', 'policy') if not hasattr(kind, method)]
+    if not callable(kind) or lacking:
+        raise ValueError(
+            f'--learner is {text!r}, which has no {" and ".join(lacking) or "constructor"}; expected a '
+            'class with the methods train and policy'
+        )
+    return kind
