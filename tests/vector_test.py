@@ -88,6 +88,17 @@ class LimitTest(parameterized.TestCase):
             ends += [count] * time_step.last()
         self.assertEqual(ends[:2], [expected, 2 * expected + 1][: len(ends)])
 
+    def test_a_fall_in_the_step_of_the_limit_is_no_truncation(self):
+        environments, steps = VectorEnvironment(GAPS, 2, 1, seed=0), 1
+        environments.reset()
+        while not environments.step(np.zeros((2, 11))).terminated[0]:
+            steps += 1
+        environments = VectorEnvironment(GAPS, 2, 1, seed=0, step_limit=steps)
+        environments.reset()
+        *_, step = (environments.step(np.zeros((2, 11))) for _ in range(steps))
+        self.assertEqual((step.terminated[0], step.truncated[0]), (True, False))
+        self.assertTrue(environments.at_limit[0])
+
     def test_simulations_are_truncated_independently(self):
         options = {'autoreset': 'disabled', 'task_kwargs': {'time_limit': 0.3}, 'step_limit': None}
         environments = VectorEnvironment(FLAT, 3, 1, seed=0, **options)
