@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import json
 import pathlib
 import runpy
@@ -10,7 +11,7 @@ from unittest import mock
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import mjcf
 from helpers import EVERY_PROPERTY as EVERY
 from helpers import FolderTest, assert_refused, assert_uniform
@@ -116,46 +117,37 @@ class WorldTest(parameterized.TestCase):
         x, y, z = variation.tilted(10.0, 0.1, np.pi / 2)
         np.testing.assert_allclose((x, y, z), (0, -10 * np.sin(0.1), -10 * np.cos(0.1)), atol=1e-12)
 
-    @parameterized.parameters(PLANAR, GAIT, MOVERS, BALL)
-    def test_masses(self, id_):
-        nominal = made(id_)
-        environment = made(id_, randomize={'mass': (0.5, 1.5), 'link_mass': (0.8, 1.2)})
+    @parameterized.parameters(PLANAR, GAIT, MOVERS, BALL, STEPS)
+    def test_bodies_and_contacts(self, id_):
+        nominal, environment = made(id_), made(id_, randomize={
+            'mass': (0.5, 1.5), 'link_mass': (0.8, 1.2), 'com_offset': 0.05, 'damping': 3.0, 'friction': 0.37,
+        })  # fmt: skip
         nominal.reset()
         for _ in range(2):
             environment.reset()
         before, after = (each.physics.model.ptr for each in (nominal, environment))
-        world, own = environment.info['world'], links(environment)
+        world, own, figure = environment.info['world'], links(environment), environment.task.figure
         expected = before.body_mass.copy()
         expected[own] *= world['mass'] * world['link_mass']
         np.testing.assert_allclose(after.body_mass, expected, rtol=1e-14)
         self.assertAlmostEqual(after.body_subtreemass[0], expected.sum(), places=9)
         ratio = after.body_inertia[own] / before.body_inertia[own]
-        np.testing.assert_allclose(
-            ratio, (after.body_mass[own] / before.body_mass[own])[:, None].repeat(3, 1)
-        )
-
-    @parameterized.parameters(PLANAR, STEPS)
-    def test_centre_of_mass_damping_and_friction(self, id_):
-        nominal = made(id_)
-        environment = made(id_, randomize={'com_offset': 0.05, 'damping': 3.0, 'friction': 0.37})
-        nominal.reset(), environment.reset()
-        before, after = (each.physics.model.ptr for each in (nominal, environment))
-        root, figure = links(environment)[0], environment.task.figure
-        offset = after.body_ipos[root] - before.body_ipos[root]
+        scale = (after.body_mass[own] / before.body_mass[own])[:, None]
+        np.testing.assert_allclose(ratio, scale.repeat(3, 1))
+        offset = after.body_ipos[own[0]] - before.body_ipos[own[0]]
         self.assertAlmostEqual(np.linalg.norm(offset), 0.05)
-        np.testing.assert_allclose(offset, environment.info['world']['com_offset'], atol=1e-12)
+        np.testing.assert_allclose(offset, world['com_offset'], atol=1e-12)
         spatial = environment.task.character.spec.spatial
         self.assertEqual(offset[1] == 0, not spatial)
         joints = figure.pose_dof[6 if spatial else 3 :]
-        self.assertGreater(before.dof_damping[joints].min(), 0)
         np.testing.assert_allclose(after.dof_damping[joints], 3 * before.dof_damping[joints])
-        seen = 0
-        for _ in range(20):
-            environment.step(zeros(environment))
-            contacts = environment.physics.data.ptr.contact
-            np.testing.assert_array_equal(contacts.friction[:, :2], 0.37)
-            seen += len(contacts.friction)
-        self.assertGreater(seen, 0)
+        if id_ in (PLANAR, STEPS):
+            self.assertGreater(before.dof_damping[joints].min(), 0)
+            found = []
+            for _ in range(15):
+                environment.step(zeros(environment))
+                found += environment.physics.data.ptr.contact.friction[:, :2].ravel().tolist()
+            self.assertEqual(set(found), {0.37})
 
     @parameterized.parameters(PLANAR, STEPS)
     def test_model_equals_one_that_is_compiled_with_these_values(self, id_):
@@ -239,14 +231,6 @@ class WorldTest(parameterized.TestCase):
             varied.reset()
             np.testing.assert_allclose(varied.info['clean_observation'], expected, atol=1e-9)
 
-    def test_a_task_that_draws_nothing_has_new_worlds_all_the_same(self):
-        environment = made(PLANAR, randomize={'friction': (0, 1)})
-        environment.task.reset, found = lambda env_ids, random_states: None, set()
-        for _ in range(4):
-            environment.reset()
-            found.add(environment.info['world']['friction'])
-        self.assertLen(found, 4)
-
     def test_presets_are_extended_and_reduced(self):
         config = WorldConfig.parse('randomize', {'preset': 'robot', 'friction': 0.3, 'push': None})
         self.assertEqual(config.friction, (0.3, 0.3))
@@ -265,8 +249,8 @@ class PushTest(parameterized.TestCase):
     """Impulse is force times duration, whatever a step is."""
 
     @parameterized.parameters(
-        (PLANAR, 0.011), (PLANAR, 0.2), (GAIT, 0.011), (GAIT, 0.2), ('PD_Biped3D_Imitate-v0', 0.011),
-        ('PD_Biped3D_Imitate-v0', 0.2), (PLAN, 0.2),
+        (PLANAR, 0.011), (PLANAR, 0.2), (GAIT, 0.011), (GAIT, 0.2), ('PD_Biped3D_Imitate-v0', 0.2),
+        (PLAN, 0.2),
     )  # fmt: skip
     def test_momentum_of_one_push(self, id_, duration):
         found, interval = [], 0.05
@@ -293,8 +277,7 @@ class PushTest(parameterized.TestCase):
         for _ in range(15):
             environment.step(zeros(environment))
             total += environment.info['impulse']
-        nominal = made(PLANAR)
-        mass = nominal.physics.model.ptr.body_mass[links(nominal)].sum()
+        mass = environment.physics.model.ptr.body_mass[links(environment)].sum() / 2
         np.testing.assert_allclose(total, (-0.5 * mass, 0, 0), rtol=1e-9)
 
     def test_times_and_forces_are_drawn_from_their_ranges(self):
@@ -314,7 +297,7 @@ class PushTest(parameterized.TestCase):
         assert_uniform(np.arctan2(y, x), -np.pi, np.pi)
         self.assertFalse(z.any())
 
-    @parameterized.parameters((PLANAR, True), (PLANAR, False), (STEPS, True))
+    @parameterized.parameters((PLANAR, False), (STEPS, True))
     def test_pushed_body(self, id_, foot):
         """It is like a constant force that a user applies to this body."""
         plain = made(id_)
@@ -373,6 +356,7 @@ class SensorTest(parameterized.TestCase):
         velocity = error[..., blocks['velocity']]
         np.testing.assert_allclose(velocity - velocity[:1], 0, atol=1e-12)  # constant
         self.assertAlmostEqual(velocity[0].std(), 0.2, delta=0.03)
+        self.assertGreater(velocity[0].std(1).min(), 0.1)  # of each number its own
         terrain = error[..., blocks['terrain']]
         offset = terrain.mean((0, 2))  # one number for the whole map
         self.assertAlmostEqual((terrain - offset[:, None]).std(), 0.05, delta=2e-3)
@@ -437,29 +421,19 @@ class SensorTest(parameterized.TestCase):
             wrong.append(seen != exact)
         self.assertAlmostEqual(np.mean(wrong), 0.25, delta=0.05)
 
-    def test_reading_twice_gives_the_same_values(self):
-        for id_ in (PLANAR, TERRAIN3D):
-            environment = made(id_, sensors=MEASURED)
-            environment.reset()
-            for _ in range(5):
-                time_step = environment.step(zeros(environment))
-            environment.task.observe()
-            np.testing.assert_array_equal(
-                environment.observation()['observations'], observed(time_step)
-            )
-
     def test_rewards_and_endings_are_those_of_the_true_state(self):
+        """And reading twice gives the same values."""
         plain, noisy = made(PLANAR), made(PLANAR, sensors=MEASURED)
         plain.reset(), noisy.reset()
-        rng = np.random.default_rng(0)
-        for _ in range(40):
-            action = rng.uniform(-1, 1, 11)
+        for action in np.random.default_rng(0).uniform(-1, 1, (30, 11)):
             a, b = plain.step(action), noisy.step(action)
             self.assertEqual(
                 (a.reward, a.discount, a.step_type), (b.reward, b.discount, b.step_type)
             )
             np.testing.assert_array_equal(noisy.info['clean_observation'], observed(a))
             self.assertFalse(np.array_equal(observed(a), observed(b)))
+            noisy.task.observe()
+            np.testing.assert_array_equal(noisy.observation()['observations'], observed(b))
 
     def test_custom_blocks_have_noise_and_custom_functions_read_the_truth(self):
         given = {
@@ -488,31 +462,6 @@ class IdentityTest(parameterized.TestCase):
             a, b = plain.step(zeros(plain)), hooked.step(zeros(hooked))
             np.testing.assert_array_equal(observed(a), observed(b))
             np.testing.assert_array_equal(plain.info['impulse'], hooked.info['impulse'])
-
-
-class GymnasiumTest(parameterized.TestCase):
-    """Adapters show world and exact observation."""
-
-    def test_info(self):
-        import gymnasium
-
-        import trl_suite.gym  # noqa: F401
-
-        options = {'task_kwargs': {'randomize': 'harsh', 'sensors': 'robot'}}
-        single = gymnasium.make(f'trl_suite/{PLANAR}', **options)
-        observation, info = single.reset(seed=3)
-        self.assertEqual(info['clean_observation'].shape, observation.shape)
-        self.assertBetween(info['world_friction'], 0.3, 1.5)
-        several = gymnasium.make_vec(
-            f'trl_suite/{PLANAR}', 2, max_episode_steps=2, autoreset_mode='SameStep', **options
-        )
-        observation, info = several.reset(seed=[3, 4])
-        self.assertEqual(info['clean_observation'].shape, observation.shape)
-        self.assertEqual(info['world_friction'][0], single.reset(seed=3)[1]['world_friction'])
-        for _ in range(2):
-            *_, info = several.step(np.zeros((2, 11)))
-        final = info['final_info']['clean_observation']
-        self.assertFalse(np.array_equal(final, info['clean_observation']))
 
 
 WORLDS = (
@@ -569,19 +518,21 @@ class RefusalTest(parameterized.TestCase):
 class ExtremeTest(parameterized.TestCase):
     """Nothing returns NaN."""
 
-    @parameterized.product(
-        id_=(PLANAR, GAIT, STEPS, PLAN, BALL),
-        world=(
-            {'friction': 0.0}, {'mass': 10.0}, {'mass': 0.1, 'inertia': 0.1}, {'gravity': 0.0},
-            {'push': {'force': 1e4, 'duration': 0.5, 'interval': 0.1}}, {'slope': 1.5},
-            {'gravity': 100.0, 'com_offset': 1.0, 'damping': 1000.0},
-            {'contact_depth': 0.1, 'contact_time': 1.0}, {'contact_depth': 1e-4, 'contact_time': 1e-3},
-        ),
+    EXTREMES = (
+        {'mass': 0.1, 'inertia': 0.1}, {'push': {'force': 1e4, 'duration': 0.5, 'interval': 0.1}},
+        {'gravity': 100.0, 'com_offset': 1.0, 'damping': 1000.0}, {'friction': 0.0}, {'mass': 10.0},
+        {'gravity': 0.0}, {'slope': 1.5}, {'contact_depth': 0.1, 'contact_time': 1.0},
+        {'contact_depth': 1e-4, 'contact_time': 1e-3},
     )  # fmt: skip
+
+    @parameterized.parameters(
+        *((PLANAR, world) for world in EXTREMES),
+        *itertools.product((GAIT, STEPS, PLAN, BALL), EXTREMES[:3]),
+    )
     def test_numbers_stay_finite(self, id_, world):
         environment = made(id_, randomize=world, sensors={'noise': 10.0, 'delay': 5})
         rng, time_step = np.random.default_rng(0), environment.reset()
-        for _ in range(6 if id_ in (GAIT, PLAN, BALL) else 60):
+        for _ in range(4 if id_ in (GAIT, PLAN, BALL) else 40):
             time_step = environment.step(rng.uniform(-1, 1, len(environment.action_map)))
             self.assertTrue(np.isfinite(observed(time_step)).all())
             self.assertTrue(np.isfinite(environment.info['clean_observation']).all())
@@ -592,9 +543,7 @@ class ProgramsTest(FolderTest):
     """The example, and the program that evaluates policies under disturbances."""
 
     def test_example(self):
-        main = runpy.run_path(str(ROOT / 'examples/randomized_worlds.py'), run_name='example')[
-            'main'
-        ]
+        main = runpy.run_path(str(ROOT / 'examples/randomized_worlds.py'))['main']
         with contextlib.redirect_stdout(io.StringIO()) as out:
             main()
         self.assertRegex(out.getvalue(), r'friction 0\.4 to 0\.8: \d+ steps on average')
@@ -605,12 +554,8 @@ class ProgramsTest(FolderTest):
         import robustness
 
         ids, path = ['PD_Biped2D_Flat-v0', PLANAR], self.folder / 'found.json'
-        strong = (
-            'push',
-            'm/s',
-            False,
-            [('9', {'randomize': {'push': {'speed': 9, 'interval': 0}}})],
-        )
+        fast = {'randomize': {'push': {'speed': 9, 'interval': 0}}}
+        strong = ('push', 'm/s', False, [('9', fast)])
         ground = ('terrain_dropout', '', True, [('0.5', {'sensors': {'terrain_dropout': 0.5}})])
         self.enterContext(mock.patch.object(robustness, 'DISTURBANCES', [strong, ground]))
         self.enterContext(mock.patch.object(robustness, 'IDS', ids))
@@ -626,7 +571,3 @@ class ProgramsTest(FolderTest):
             robustness.run(ids, 3, [0], 1, 40, path)
         share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
         self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
-
-
-if __name__ == '__main__':
-    absltest.main()
