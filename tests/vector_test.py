@@ -108,6 +108,7 @@ class LimitTest(parameterized.TestCase):
         environments.reset([1])
         other = VectorEnvironment(FLAT, 3, 1, seed=9, **options)
         other.set_state(environments.get_state())
+        np.testing.assert_array_equal(other.seeds, environments.seeds)
         for each in environments, other:
             for _ in range(5):
                 step = each.step(IDLE)
