@@ -14,6 +14,7 @@ from helpers import (
     RIGHT,
     FolderTest,
     angle_between,
+    ankles,
     assert_refused,
     assert_uniform,
     body,
@@ -158,6 +159,27 @@ class PlanTest(parameterized.TestCase):
                 self.assertAlmostEqual(place[2], height, delta=1e-5)
             self.assertLess(angle_between(task.heading[0], heading + plan[4]), 1e-9)
             np.testing.assert_array_equal(seen, np.tile(seen[0], (15, 1)))
+
+    def test_inputs_of_the_controller(self):
+        phases, default = [], shipped_controller()
+
+        def controller(observation):
+            feet, heading, swing = ankles(environment), heading_of(environment), 1 - task.stance[0]
+            slots = observation[0, 112:124].reshape(2, 2, 3)
+            for which, foot in enumerate((swing, 1 - swing)):
+                way = turned((task.landing[0, which] - feet[foot])[:2], -heading)
+                np.testing.assert_allclose(slots[which, foot, :2], way, atol=1e-9)
+                np.testing.assert_array_equal(slots[which, 1 - foot], 0)
+            off = angle_between(heading + observation[0, 124], task.heading[0])
+            self.assertLess(off, 1e-9)
+            phases.append(observation[0, 105])
+            return default(observation)
+
+        environment, _ = started(SOCCER, controller=controller)
+        task = environment.task
+        for _ in range(2):
+            environment.step(AHEAD)
+        np.testing.assert_allclose(phases, np.arange(30) / 30, atol=1e-6)
 
 
 def goal_reward(speed, target=1.0):
