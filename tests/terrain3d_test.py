@@ -450,19 +450,19 @@ class GroundTest(parameterized.TestCase):
     def test_seeds_and_states(self, source):
         x, y = np.random.default_rng(0).uniform(-15, 15, (2, 800))
         sequence = np.random.SeedSequence(5)
-        ground = make(source, sequence)
-        heights, flow = ground.height(x, y), flow_of(source, ground, x, y)
-        restored = terrain.SpatialGround.from_state(pickle.loads(pickle.dumps(ground.state())))
-        for other in (
-            make(source, 5),
+        ground, spawned = (
             make(source, sequence),
-            restored,
-            pickle.loads(pickle.dumps(ground)),
-        ):
-            np.testing.assert_array_equal(other.height(x, y), heights)
-            np.testing.assert_array_equal(flow_of(source, other, x, y), flow)
-            spawns = (each.spawn(np.random.default_rng(3)) for each in (other, ground))
-            self.assertEqual(*spawns)
+            make(source, np.random.SeedSequence(5).spawn(3)[2]),
+        )
+        heights, flow = ground.height(x, y), flow_of(source, ground, x, y)
+        restored = terrain.SpatialGround.from_state(pickle.loads(pickle.dumps(spawned.state())))
+        for one, other in (
+            (ground, make(source, 5)), (ground, make(source, sequence)), (spawned, restored),
+            (spawned, pickle.loads(pickle.dumps(spawned))),
+        ):  # fmt: skip
+            np.testing.assert_array_equal(other.height(x, y), one.height(x, y))
+            np.testing.assert_array_equal(*(flow_of(source, each, x, y) for each in (one, other)))
+            self.assertEqual(*(each.spawn(np.random.default_rng(3)) for each in (one, other)))
         self.assertEqual(sequence.n_children_spawned, 0)
         others = [make(source, seed) for seed in range(6, 10)]
         differs = any(not np.array_equal(other.height(x, y), heights) for other in others)
