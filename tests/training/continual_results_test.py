@@ -2,14 +2,12 @@
 
 import copy
 import json
-import pathlib
-import tempfile
 from unittest import mock
 
 import continual_results
 import numpy as np
 import pytest
-from absl.testing import absltest
+from helpers import FolderTest
 
 from trl_suite import evaluation, sequences
 from trl_suite.runs import results
@@ -27,19 +25,16 @@ class Fixed:
         return lambda observation: observation
 
 
-class ResultsTest(absltest.TestCase):
+class ResultsTest(FolderTest):
     def setUp(self):
         super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-        def made_up(cases, *_, **__):
-            return [{'normalized_return': 0.1}] * len(cases)
-
+        made_up = mock.Mock(
+            side_effect=lambda cases, *_, **__: [{'normalized_return': 0.1}] * len(cases)
+        )
+        path = self.folder / 'template.json'
         with mock.patch.object(evaluation, 'evaluate_all', made_up):
-            self.template = sequences.run(
-                'plaid_biped', Fixed(), 100, self.folder / 'template.json', 1
-            )
-        (self.folder / 'template.json').unlink()
+            self.template = sequences.run('plaid_biped', Fixed(), 100, path, 1)
+        path.unlink()
 
     def store(self, learner, seed, scores, curve):
         """Writes a run of len(scores) stages with the same curve in all of them."""
@@ -102,7 +97,7 @@ class ResultsTest(absltest.TestCase):
             continual_results.load(self.folder)
 
 
-class PageTest(absltest.TestCase):
+class PageTest(FolderTest):
     def test_page_is_made_from_the_results(self):
         """Run `python training/continual_results.py` if this fails."""
         text = (continual_results.DOCS / 'continual_learning.md').read_text(encoding='utf-8')
@@ -120,11 +115,7 @@ class PageTest(absltest.TestCase):
         text = (continual_results.DOCS / 'continual_learning.md').read_text(encoding='utf-8')
         code = text.split('```python\n')[1].split('```')[0]
         names = {'__name__': 'page'}
-        folder = self.enterContext(tempfile.TemporaryDirectory())
-        code = code.replace("'result.json'", repr(f'{folder}/result.json')).replace('1000', '200')
+        path = repr(f'{self.folder}/result.json')
+        code = code.replace("'result.json'", path).replace('1000', '200')
         exec(compile(code, 'continual_learning.md', 'exec'), names)
         self.assertEqual(np.diag(names['result']['samples']).tolist(), [192] * 5)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -1,13 +1,12 @@
 """Q-learning over base actions: transitions, retries, the exported policy, exact resumption."""
 
 import dataclasses
-import pathlib
-import tempfile
 
 import learn_gaits
 import numpy as np
 import torch
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
+from helpers import FolderTest
 
 from trl_suite import policies
 from trl_suite.util import machine
@@ -22,12 +21,32 @@ TINY = learn_gaits.Settings(
 )  # fmt: skip
 
 
-class LearnTest(parameterized.TestCase):
+def make(advances=0, seed=1, **changes):
+    learner = learn_gaits.Learner(HOPPER, seed, dataclasses.replace(TINY, **changes), 1)
+    for _ in range(advances):
+        learner.advance()
+    return learner
+
+
+def trained_in_parts(test, train, settings, parts, files):
+    """Checks that a run in parts is that in one go; returns its folder, its curve, and a policy."""
+    curves, folders = [], [test.folder / each for each in 'ab']
+    for folder, ends in zip(folders, (parts[-1:], parts), strict=True):
+        for samples in ends:
+            own = dataclasses.replace(settings, samples=samples)
+            curve = train(HOPPER, 1, own, folder, 1)
+        curves.append([{**point, 'seconds': None} for point in curve])
+    test.assertEqual(*curves)
+    for file in files:
+        test.assertEqual(*((folder / file).read_bytes() for folder in folders))
+    policy = policies.load(folders[0] / 'policy.npz')
+    policy.check(VectorEnvironment(HOPPER, 1, 1))
+    return folders[0], curves[0], policy
+
+
+class LearnTest(FolderTest):
     def test_transitions_and_retries(self):
-        settings = dataclasses.replace(
-            TINY, expert_cycles=1e9, expert_epsilon=1.0, retry=1.0, retries=2
-        )
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner = make(expert_cycles=1e9, expert_epsilon=1.0, retry=1.0, retries=2)
         learner.expert = None  # random base actions fall soon
         tried = []
         for _ in range(24):
@@ -44,15 +63,15 @@ class LearnTest(parameterized.TestCase):
         self.assertTrue((reward[discount > 0] >= 0.5 * (1 + 0.95 + 0.95**2) - 1e-6).all())
         self.assertIn(0.0, reward[discount == 0])
         for env_id, past in enumerate(learner.past):
-            self.assertLessEqual(len(past), settings.back[1] + 1, env_id)
+            self.assertLessEqual(len(past), learner.settings.back[1] + 1, env_id)
 
     @parameterized.parameters('discrete', 'both')
     def test_an_ensemble_learns_and_selects_by_mean_values(self, action):
-        settings = dataclasses.replace(
-            TINY, action=action, expert_cycles=0, begin=0, members=3, updates=0, renew_every=16,
-            epsilon=0.0, noise_share=0.0, retry=0.0,
-        )  # fmt: skip
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        settings = {
+            'action': action, 'expert_cycles': 0, 'begin': 0, 'members': 3, 'updates': 0,
+            'renew_every': 16, 'epsilon': 0.0, 'noise_share': 0.0, 'retry': 0.0,
+        }  # fmt: skip
+        learner = make(**settings)
         while learner.samples < 16:
             learner.advance()
         self.assertLen(learner.members, 3)
@@ -68,13 +87,13 @@ class LearnTest(parameterized.TestCase):
         if action == 'discrete':
             expected = learner.choices[chosen]
             np.testing.assert_allclose(policy(observation), expected, atol=learn_gaits.CHOICE_ERROR)
-        other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+        other = make(seed=2, **settings)
         other.begin_with(policy)
         with torch.no_grad():
             np.testing.assert_allclose(other.network(seen), values[0], rtol=1e-4, atol=1e-5)
 
     def test_a_restored_simulation_has_its_old_state(self):
-        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, retry=1.0), 1)
+        learner = make(retry=1.0)
         seen = []
         for _ in range(3):
             seen.append(learner.observation.copy())
@@ -104,9 +123,7 @@ class LearnTest(parameterized.TestCase):
 
     @parameterized.parameters(*learn_gaits.ACTIONS)
     def test_the_policy_selects_as_the_network(self, action):
-        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, action=action), 1)
-        for _ in range(6):
-            learner.advance()
+        learner = make(6, action=action)
         if learner.settings.actors:
             torch.nn.init.normal_(learner.target.actors.weight)
         policy = learner.exported()
@@ -128,8 +145,7 @@ class LearnTest(parameterized.TestCase):
         self.assertEqual(np.abs(changes).max() > 0.1, action != 'discrete')
 
     def test_actors_learn_from_noise_that_pays_and_values_from_the_rest(self):
-        settings = dataclasses.replace(TINY, action='both', begin=1e9, minibatch=32, updates=1)
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner = make(action='both', begin=1e9, minibatch=32, updates=1)
         for _ in range(4):
             learner.collect()
         replay, size = learn_gaits.Replay(64, len(learner.columns), 3), learner.choices.shape[1]
@@ -151,8 +167,7 @@ class LearnTest(parameterized.TestCase):
         np.testing.assert_array_equal(changes[0, 0], 0)  # this expert was not selected
 
     def test_noise_is_added_in_its_share_of_cycles_and_not_where_greedy(self):
-        settings = dataclasses.replace(TINY, num_envs=8, action='continuous', noise_share=0.5)
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner = make(num_envs=8, action='continuous', noise_share=0.5)
         acts = [learner.act() for _ in range(200)]
         noisy = np.array([act.noisy for act in acts])
         self.assertFalse(noisy[:, learner.greedy].any())
@@ -164,41 +179,29 @@ class LearnTest(parameterized.TestCase):
 
     @parameterized.parameters(('discrete', 'discrete'), ('discrete', 'both'), ('both', 'both'))
     def test_a_run_begins_with_a_policy(self, first, second):
-        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, action=first), 1)
-        for _ in range(6):
-            learner.advance()
+        learner = make(6, action=first)
         if first == 'both':
             torch.nn.init.normal_(learner.target.actors.weight)
-        with tempfile.TemporaryDirectory() as name:
-            path = f'{name}/policy.npz'
-            policies.save(learner.exported(), path)
-            settings = dataclasses.replace(TINY, start=path, action=second)
-            other = learn_gaits.Learner(HOPPER, 2, settings, 1)
-            observation = learner.replay.before[: len(learner.replay)].astype(float)
-            with torch.no_grad():
-                seen = learner.seen(observation)
-                for ours, theirs in zip(
-                    learner.target.both(seen), other.network.both(seen), strict=True
-                ):
-                    np.testing.assert_allclose(theirs, ours, atol=1e-5)
-            before = other.mean.copy()
-            for _ in range(4):
-                other.advance()
-            np.testing.assert_array_equal(other.mean, before)
-        with self.assertRaisesRegex(ValueError, 'other inputs'):
-            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, start=HOPPER), 1)
+        path = f'{self.folder}/policy.npz'
+        policies.save(learner.exported(), path)
+        other = make(seed=2, start=path, action=second)
+        with torch.no_grad():
+            seen = learner.seen(learner.replay.before[: len(learner.replay)].astype(float))
+            both = learner.target.both(seen), other.network.both(seen)
+        for ours, theirs in zip(*both, strict=True):
+            np.testing.assert_allclose(theirs, ours, atol=1e-5)
+        before = other.mean.copy()
+        for _ in range(4):
+            other.advance()
+        np.testing.assert_array_equal(other.mean, before)
 
     def test_a_run_selects_among_further_gaits(self):
-        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
-        for _ in range(6):
-            learner.advance()
+        learner = make(6)
         gait = learner.environments.task.gait.parameters
         names = ('foot_back', 'steady')
-        with tempfile.TemporaryDirectory() as name:
-            path = f'{name}/policy.npz'
-            policies.save(learner.exported(), path)
-            settings = dataclasses.replace(TINY, start=path, gaits=names)
-            other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+        path = f'{self.folder}/policy.npz'
+        policies.save(learner.exported(), path)
+        other = make(seed=2, start=path, gaits=names)
         count = len(gait.base_actions)
         found = gait.vector(other.choices[count:])
         np.testing.assert_allclose(found, [gait.sets[name] for name in names], atol=1e-9)
@@ -209,14 +212,9 @@ class LearnTest(parameterized.TestCase):
         expected = before.mean(1, keepdim=True).expand(-1, len(names))
         np.testing.assert_allclose(values[:, count:], expected, atol=1e-5)
         self.assertLen(other.exported().choices, count + len(names))
-        with self.assertRaisesRegex(ValueError, "'tuned'.*did you mean"):
-            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, gaits=('tuned',)), 1)
-        with self.assertRaisesRegex(ValueError, "'big_hop'.*within the action range"):
-            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, gaits=('big_hop',)), 1)
 
     def test_several_environments_share_the_simulations(self):
-        settings = dataclasses.replace(TINY, num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner = make(num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
         self.assertEqual(learner.ids, [HOPPER, WALLS, HOPPER])
         self.assertEqual([group.num_envs for group in learner.simulations.parts], [2, 2, 1])
         np.testing.assert_array_equal(learner.simulations.group, [0, 0, 1, 1, 2])
@@ -239,8 +237,7 @@ class LearnTest(parameterized.TestCase):
         self.assertFalse((learner.simulations.observation[:3] == other[:3]).all())
 
     def test_metres_and_falls_are_counted_without_random_actions(self):
-        settings = dataclasses.replace(TINY, also=(WALLS,), evaluation_episodes=0)
-        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner = make(also=(WALLS,), evaluation_episodes=0)
         steps, step = [], learner.simulations.step
         learner.simulations.step = lambda action: steps.append(step(action)) or steps[-1]
         for _ in range(30):
@@ -260,13 +257,17 @@ class LearnTest(parameterized.TestCase):
         np.testing.assert_array_equal(learner.tally, 0)
         self.assertNotIn('distance', learner.evaluate())  # nothing has moved since
 
-    def test_unknown_and_foreign_environments_are_refused(self):
-        with self.assertRaisesRegex(ValueError, 'FSM_Hoper'):
-            learn_gaits.environments_of(HOPPER, dataclasses.replace(TINY, also=('FSM_Hoper_*',)))
-        with self.assertRaisesRegex(ValueError, 'different characters'):
-            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, also=('FSM_Goat2D_*',)), 1)
-        with self.assertRaisesRegex(ValueError, '4 simulations for 10 environments'):
-            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, also=('FSM_Hopper2D_*',)), 1)
+    @parameterized.parameters(
+        ({'also': ('FSM_Hoper_*',)}, 'FSM_Hoper'),
+        ({'also': ('FSM_Goat2D_*',)}, 'different characters'),
+        ({'also': ('FSM_Hopper2D_*',)}, '4 simulations for 10 environments'),
+        ({'gaits': ('tuned',)}, "'tuned'.*did you mean"),
+        ({'gaits': ('big_hop',)}, "'big_hop'.*within the action range"),
+        ({'start': HOPPER}, 'other inputs'),
+    )
+    def test_bad_settings_are_refused(self, changes, message):
+        with self.assertRaisesRegex(ValueError, message):
+            make(**changes)
 
     @parameterized.parameters(
         {},
@@ -274,31 +275,17 @@ class LearnTest(parameterized.TestCase):
         {'action': 'both', 'noise_share': 0.9, 'members': 2},
     )
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
-        curves = []
-        with tempfile.TemporaryDirectory() as name:
-            folders = [pathlib.Path(name) / each for each in 'ab']
-            for folder, samples in zip(folders, ((48,), (24, 48)), strict=True):
-                for each in samples:
-                    settings = dataclasses.replace(TINY, samples=each, **changes)
-                    curve = learn_gaits.train(HOPPER, 1, settings, folder, 1)
-                curves.append([{**point, 'seconds': None} for point in curve])
-            self.assertEqual([point['samples'] for point in curves[0]], [32, 48])
-            self.assertEqual(*curves)
-            for file in ('policy.npz', 'last.npz'):
-                self.assertEqual(*((folder / file).read_bytes() for folder in folders))
-            policy = policies.load(folders[0] / 'policy.npz')
-            policy.check(VectorEnvironment(HOPPER, 1, 1))
-            self.assertEqual(policy.info['samples'], 48)
-            self.assertLessEqual(machine.made_with().items(), policy.info.items())
-            # Another final phase is repeated, from the same transitions.
-            members = settings.members + 1
-            more = dataclasses.replace(settings, members=members)
-            learn_gaits.train(HOPPER, 1, more, folders[0], 1)
-            self.assertLen(policies.load(folders[0] / 'policy.npz').networks, members)
-            with self.assertRaisesRegex(ValueError, 'other settings'):
-                other = dataclasses.replace(TINY, alive=1.0, **changes)
-                learn_gaits.train(HOPPER, 1, other, folders[0], 1)
-
-
-if __name__ == '__main__':
-    absltest.main()
+        settings = dataclasses.replace(TINY, **changes)
+        folder, curve, policy = trained_in_parts(
+            self, learn_gaits.train, settings, (24, 48), ('policy.npz', 'last.npz')
+        )
+        self.assertEqual([point['samples'] for point in curve], [32, 48])
+        self.assertLessEqual(machine.made_with().items(), policy.info.items())
+        self.assertEqual(policy.info['samples'], 48)
+        # Another final phase is repeated, from the same transitions.
+        more = dataclasses.replace(settings, members=settings.members + 1)
+        learn_gaits.train(HOPPER, 1, more, folder, 1)
+        self.assertLen(policies.load(folder / 'policy.npz').networks, more.members)
+        with self.assertRaisesRegex(ValueError, 'other settings'):
+            other = dataclasses.replace(settings, alive=1.0)
+            learn_gaits.train(HOPPER, 1, other, folder, 1)

@@ -107,7 +107,3 @@ class OracleTest(absltest.TestCase):
             self.assertLen(some, len(oracles.SECONDS))
             self.assertTrue((some >= mean).all())
             self.assertBetween(each['ever_prevented'], some.max(), 1.0)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -1,5 +1,6 @@
 """The trainer of training/ppo.py: its parts, exact resumption, and learning."""
 
+import copy
 import dataclasses
 import io
 import json
@@ -14,20 +15,11 @@ import numpy as np
 import ppo
 import pytest
 import runs
+import settings
 import torch
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import FolderTest
-from settings import (
-    LOW,
-    Settings,
-    crowded,
-    evenly,
-    joined,
-    rising,
-    settings_for,
-    with_larger,
-    with_walls,
-)
+from settings import Settings, settings_for
 
 from trl_suite import evaluation, policies, terrain
 from trl_suite.registry import catalogue
@@ -71,14 +63,11 @@ class PartsTest(parameterized.TestCase):
         ended = random.random((9, 4)) < 0.2
         found = ppo.advantages(reward, value, following, ended, 0.9, 0.8)
         error = reward + 0.9 * following - value
-        for t in range(9):
-            for env_id in range(4):
-                expected = 0.0
-                for k in range(t, 9):
-                    expected += (0.9 * 0.8) ** (k - t) * error[k, env_id]
-                    if ended[k, env_id]:
-                        break
-                self.assertAlmostEqual(found[t, env_id], expected)
+        for t, env_id in np.ndindex(9, 4):
+            ends = np.flatnonzero(ended[t:, env_id])
+            sum_ = error[t : t + ends[0] + 1 if len(ends) else None, env_id]
+            expected = (0.9 * 0.8) ** np.arange(len(sum_)) @ sum_
+            self.assertAlmostEqual(found[t, env_id], expected)
 
     def test_scales(self):
         data = np.random.default_rng(0).normal(3, [1, 5, 0.2, 2, 1e-6, 4], (1000, 6))
@@ -150,8 +139,8 @@ class PartsTest(parameterized.TestCase):
         (FLAT, {'activation': 'rely'}, "unknown activation 'rely'.*'relu'"),
         (BLOCKS, {'convolutions': ((4, 4, 2),)}, 'convolutions: .*expected a map_bound'),
         (FLAT, {'convolutions': ((4, 4, 2),), 'map_bound': 1.0}, 'not maps of the ground: pose'),
-        (FLAT, {'stages': evenly([{}] * 2), 'stages_averaged': 0}, 'stages_averaged: 0; expected 1 to 2'),
-        (FLAT, {'stages': evenly([{}] * 2), 'stages_averaged': 3}, 'stages_averaged: 3; expected 1 to 2'),
+        (FLAT, {'stages': settings.evenly([{}] * 2), 'stages_averaged': 0}, 'stages_averaged: 0; expected 1 to 2'),
+        (FLAT, {'stages': settings.evenly([{}] * 2), 'stages_averaged': 3}, 'stages_averaged: 3; expected 1 to 2'),
         ('PD_Biped2D_Flat-v0', {'hidden': (256, 256), 'start': 'PD_Dog2D_LLC_Imitate_Flat-v0'},
          'PD_Biped2D_Flat-v0 has other actions than PD_Dog2D'),
     )  # fmt: skip
@@ -163,10 +152,8 @@ class PartsTest(parameterized.TestCase):
         """Both velocity maps are reduced as the height map."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
         two = {'surface': slice(0, 2048), 'pose': slice(2048, 2054)}
-        near, both = (
-            networks.visible(blocks, size, (2.5, 1.0))
-            for blocks, size in ((one, 1030), (two, 2054))
-        )
+        near = networks.visible(one, 1030, (2.5, 1.0))
+        both = networks.visible(two, 2054, (2.5, 1.0))
         count = len(near) - 6
         self.assertEqual(count, 10 * 6)  # 11 m by 11 m at 32 by 32 points: 3.5 m along, 2 m across
         np.testing.assert_array_equal(both[count : 2 * count], near[:count] + 1024)
@@ -174,32 +161,34 @@ class PartsTest(parameterized.TestCase):
         self.assertIsNone(networks.visible({'pose': slice(0, 6)}, 6, (2.5, 1.0)))
 
 
+def grounds(id_, stages):
+    """Yields the ground of every simulation in each third of a run."""
+    trainer = make(id_, samples=300, stages=stages)
+    for samples in (0, 100, 200):
+        trainer.samples = samples
+        trainer.begin_stage()
+        task = trainer.environments.task
+        yield [task.arena.grounds[i] for i in range(TINY['num_envs'])]
+        assert trainer.spec.terrain == catalogue.BY_ID[id_].terrain  # where it is evaluated
+
+
 class CurriculumTest(parameterized.TestCase):
     def test_rising_walls(self):
-        stages = rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
-        trainer = make('PD_Biped2D_Mixed_Terrain-v0', samples=300, stages=stages)
-        heights = []
-        for samples in (0, 100, 200):
-            trainer.samples = samples
-            trainer.begin_stage()
-            strips = (trainer.environments.task.arena.grounds[i] for i in range(TINY['num_envs']))
-            heights += {
-                tuple(s.parameters[f'WallH{end}'] for end in ('Min', 'Max')) for s in strips
-            }
-        np.testing.assert_allclose(heights, [(0.1, 0.2), (0.175, 0.3), (0.25, 0.4)])
-        self.assertEqual(trainer.environments.spec.terrain, 'mixed_humanoid')
-        self.assertEqual(trainer.spec.terrain, 'mixed_humanoid')  # where it is evaluated
+        stages = settings.rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
+        heights = [
+            {(s.parameters['WallHMin'], s.parameters['WallHMax']) for s in strips}
+            for strips in grounds('PD_Biped2D_Mixed_Terrain-v0', stages)
+        ]
+        np.testing.assert_allclose(
+            [pair for (pair,) in heights], [(0.1, 0.2), (0.175, 0.3), (0.25, 0.4)]
+        )
 
     def test_dense_obstacles(self):
-        stages = crowded('slopes_mixed_humanoid')
-        trainer = make('PD_Biped2D_Slopes_Mixed_Terrain-v0', samples=300, stages=stages)
+        stages = settings.crowded('slopes_mixed_humanoid')
         spacings, types = [], []
-        for samples in (0, 100, 200):
-            trainer.samples = samples
-            trainer.begin_stage()
-            ground = trainer.environments.task.arena.terrain
-            types.append(ground.type)
-            values = ground.parameters()
+        for strips in grounds('PD_Biped2D_Slopes_Mixed_Terrain-v0', stages):
+            values = strips[0].parameters
+            types.append(strips[0].type)
             names = (f'{name}SpacingMax' for name in ('Wall', 'Gap'))
             spacings += [values[name] for name in names if name in values]
             self.assertEqual(values['WallHMax'], 0.4)
@@ -207,12 +196,12 @@ class CurriculumTest(parameterized.TestCase):
         np.testing.assert_allclose(spacings, [8 / 3, 8 / 3, 8 / 3, 4, 4])
 
     def test_half_of_the_simulations_may_have_walls_only(self):
-        stages = with_walls('slopes_mixed_humanoid')
+        stages = settings.with_walls('slopes_mixed_humanoid')
         trainer = make('PD_Raptor2D_Slopes_Mixed_Terrain-v0', stages=stages)
-        grounds = [part.task.arena.grounds[0] for part in trainer.environments.parts]
-        types = [ground.type for ground in grounds]
+        halves = [part.task.arena.grounds[0] for part in trainer.environments.parts]
+        types = [ground.type for ground in halves]
         self.assertEqual(types, ['var2d_slopes_mixed', 'var2d_slopes_walls'])
-        self.assertEqual([ground.parameters['WallHMax'] for ground in grounds], [0.4, 0.4])
+        self.assertEqual([ground.parameters['WallHMax'] for ground in halves], [0.4, 0.4])
 
     @parameterized.parameters(
         ('gaps_humanoid', {'GapW': (0.275, 0.33)}),
@@ -221,7 +210,7 @@ class CurriculumTest(parameterized.TestCase):
          {'GapW': (0.4, 0.55), 'WallH': (0.325, 0.44), 'StepH0': (0.2, 0.33), 'StepH1': (-0.33, -0.2)}),
     )  # fmt: skip
     def test_half_of_the_simulations_may_have_larger_obstacles(self, preset, expected):
-        ((begin, (own, larger)),) = with_larger(preset)
+        ((begin, (own, larger)),) = settings.with_larger(preset)
         self.assertEqual((begin, own), (0.0, {}))
         given, ground = terrain.load(preset), terrain.load(larger['terrain'])
         self.assertEqual(ground.type, given.type)
@@ -232,8 +221,9 @@ class CurriculumTest(parameterized.TestCase):
         self.assertEqual({name for name in after if after[name] != before[name]}, changed)
 
     def test_curricula_may_be_joined(self):
-        heights, dense = rising('mixed_humanoid', LOW, (0.0, 0.5)), crowded('mixed_humanoid')
-        found = joined(heights, dense)
+        heights = settings.rising('mixed_humanoid', settings.LOW, (0.0, 0.5))
+        dense = settings.crowded('mixed_humanoid')
+        found = settings.joined(heights, dense)
         np.testing.assert_allclose([begin for begin, _ in found], np.arange(5) / 5)
         expected = [options for _, options in (*heights[:2], *dense)]
         self.assertEqual([options for _, options in found], expected)
@@ -243,10 +233,7 @@ class CurriculumTest(parameterized.TestCase):
 class StartTest(parameterized.TestCase):
     """Runs that start from a policy, and what policies are made of."""
 
-    @parameterized.parameters(
-        ('PD_Biped2D_Gaps_Terrain-v0',),  # the same observation
-        ('PD_Biped2D_Flat-v0',),  # one without the terrain
-    )
+    @parameterized.parameters('PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped2D_Flat-v0')  # without terrain
     def test_a_run_may_start_from_another_policy(self, id_):
         other = policies.reference(START)
         trainer, flat = (make(each, hidden=(256, 256), start=START) for each in (id_, START))
@@ -282,9 +269,8 @@ class StartTest(parameterized.TestCase):
     @parameterized.parameters((2e4, 100.0), (1e9, 1e6))
     def test_scales_of_an_initial_policy_are_kept_for_the_given_time(self, count, least):
         """After a hundredth as many observations, means have moved by less than the step."""
-        trainer = make(
-            'PD_Biped2D_Gaps_Terrain-v0', hidden=(256, 256), start=START, start_count=count
-        )
+        own = {'hidden': (256, 256), 'start': START, 'start_count': count}
+        trainer = make('PD_Biped2D_Gaps_Terrain-v0', **own)
         pose, scales = trainer.environments.blocks['pose'], trainer.scales
         before = scales.mean[pose].copy()
         scales.update(np.broadcast_to(scales.mean + 1.0, (200, len(scales.mean))))
@@ -313,6 +299,12 @@ class StartTest(parameterized.TestCase):
             expected = value if expected is None else 0.75 * expected + 0.25 * value
         np.testing.assert_allclose(trainer.exported().biases[-1], expected, rtol=1e-6)
 
+    def assert_continues(self, id_, policy, observation, *changes, same=True):
+        """Checks whether further runs with certain settings begin with what a policy does."""
+        for own in changes:
+            found = make(id_, policy, 1, **own).exported()(observation)
+            self.assertEqual(np.allclose(found, policy(observation), atol=1e-4), same, own)
+
     def test_policies_can_have_cartesian_inputs(self):
         """By the network in training as by what it exports; and a start that saw them fits."""
         places = ('goal', 'ball')
@@ -323,14 +315,16 @@ class StartTest(parameterized.TestCase):
         np.testing.assert_array_equal(policy.places, expected)
         self.assertLen(policy.mean, policy.observation_size + 4)
         np.testing.assert_allclose(policy(trainer.observation), inside(trainer), atol=1e-5)
-        policy = varied(policy, 1.0)
-        for names, same in ((places, True), (places[::-1], True), (places[1:], False)):
-            other = make(SOCCER, policy, 1, places=names, mirrored=True)
-            found = other.exported()(trainer.observation)
-            self.assertEqual(np.allclose(found, policy(trainer.observation), atol=1e-4), same)
+        both, turned, one = (
+            {'places': p, 'mirrored': True} for p in (places, places[::-1], places[1:])
+        )
+        case = SOCCER, varied(policy, 1.0), trainer.observation
+        self.assert_continues(*case, both, turned)
+        self.assert_continues(*case, one, same=False)
 
     def test_maps_may_be_clipped(self):
-        trainer = make(BLOCKS, map_bound=0.3, view=(6.0, 3.0))
+        own = {'map_bound': 0.3, 'view': (6.0, 3.0)}
+        trainer = make(BLOCKS, **own)
         trainer.collect()
         policy, observation = trainer.exported(), trainer.observation.copy()
         self.assertTrue((trainer.scales(observation).abs().max(1).values > 0.99).any())  # walls
@@ -339,11 +333,9 @@ class StartTest(parameterized.TestCase):
         part, cut = trainer.environments.blocks['terrain'], observation.copy()
         cut[:, part] = np.clip(cut[:, part], -0.3, 0.3)
         np.testing.assert_allclose(policy(cut), policy(observation), atol=1e-6)
-        policy = varied(policy)
-        for bound, same in ((0.3, True), (0.5, False)):
-            other = make(BLOCKS, policy, 1, map_bound=bound, view=(6.0, 3.0))
-            found = other.exported()(observation)
-            self.assertEqual(np.allclose(found, policy(observation), atol=1e-4), same)
+        self.assert_continues(BLOCKS, varied(policy), observation, own)
+        wider = {**own, 'map_bound': 0.5}
+        self.assert_continues(BLOCKS, varied(policy), observation, wider, same=False)
 
     def test_policies_may_have_convolutions_over_maps(self):
         id_, own = 'PD_Biped3D_HLC_DynamicsObstacles-v0', {
@@ -360,8 +352,7 @@ class StartTest(parameterized.TestCase):
         mean = networks.mean_of([policy, policy])
         np.testing.assert_allclose(mean(observation), policy(observation), atol=1e-5)
         policy = varied(policy)
-        other = make(id_, policy, 1, **own)
-        np.testing.assert_allclose(other.exported()(observation), policy(observation), atol=1e-4)
+        self.assert_continues(id_, policy, observation, own)
         for changes in (
             {'convolutions': ((4, 4, 2),)}, {'convolutions': ()}, {'view': (6.0, 3.0)},
             {'map_bound': 2.0},
@@ -401,10 +392,8 @@ class ImitationTest(FolderTest):
     def test_after_the_first_round_the_policy_walks(self):
         seen = []
         for clonings in (1, 2):
-            trainer = make(
-                SOCCER, start='scripted', cloned=160, clonings=clonings, initial_std=1e-9
-            )
-            seen.append(self.actions(trainer))
+            own = {'cloned': 160, 'clonings': clonings, 'initial_std': 1e-9}
+            seen.append(self.actions(make(SOCCER, start='scripted', **own)))
         half = len(seen[0]) // 2
         np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
         self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
@@ -552,14 +541,10 @@ class RunTest(FolderTest):
     @parameterized.parameters(False, True)
     def test_an_update_ends_at_its_kl_limit(self, value_goes_on):
         trainer = make(kl_per_action=-1.0, value_goes_on=value_goes_on)
-        before = [
-            {name: weight.clone() for name, weight in part.state_dict().items()}
-            for part in (trainer.policy, trainer.value)
-        ]
+        parts = trainer.policy, trainer.value
+        before = [copy.deepcopy(part.state_dict()) for part in parts]
         trainer.learn(trainer.collect())
-        for part, old, same in zip(
-            (trainer.policy, trainer.value), before, (True, not value_goes_on), strict=True
-        ):
+        for part, old, same in zip(parts, before, (True, not value_goes_on), strict=True):
             for name, weight in part.state_dict().items():
                 self.assertEqual(torch.equal(weight, old[name]), same, name)
 
@@ -627,7 +612,7 @@ class RunTest(FolderTest):
 
     def test_the_exported_policy_may_be_the_mean_over_ends_of_stages(self):
         samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a curriculum stage
-        self.train('run', samples=3 * samples, stages=evenly([{}] * 3), stages_averaged=2)
+        self.train('run', samples=3 * samples, stages=settings.evenly([{}] * 3), stages_averaged=2)
         first, second, best, last = (
             policies.load(self.folder / 'run' / f'{name}.npz')
             for name in ('stage_1', 'stage_2', 'policy', 'last')
@@ -646,7 +631,3 @@ class RunTest(FolderTest):
         found = evaluation.evaluate(FLAT, policies.load(folder / 'last.npz'), 32, seed=1)
         self.assertGreater(found['normalized_return'], 0.6)
         self.assertGreater(found['completion_rate'], 0.9)
-
-
-if __name__ == '__main__':
-    absltest.main()

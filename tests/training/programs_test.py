@@ -6,8 +6,6 @@ import io
 import json
 import os
 import pathlib
-import sys
-import tempfile
 from types import SimpleNamespace
 from unittest import mock
 
@@ -28,6 +26,7 @@ import train_all
 import train_randomized
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
+from programs import output
 
 from trl_suite import benchmark, characters, evaluation, policies
 from trl_suite.registry import catalogue
@@ -46,15 +45,9 @@ class CompareTest(FolderTest):
             return job(cell, seed, samples)
 
         compared = compare.COMPARISONS[name]._replace(job=counted)
-        argv = ['compare.py', name, '--json', str(self.folder / 'found.json'), *arguments]
-        with (
-            mock.patch.dict(compare.COMPARISONS, {name: compared}),
-            mock.patch.object(sys, 'argv', argv),
-            contextlib.redirect_stdout(io.StringIO()) as out,
-            contextlib.redirect_stderr(io.StringIO()),
-        ):
-            compare.main()
-        return trained, out.getvalue()
+        with mock.patch.dict(compare.COMPARISONS, {name: compared}):
+            out = output(compare.main, name, '--json', self.folder / 'found.json', *arguments)
+        return trained, out
 
     def drawn(self, name, job, *arguments):
         """Returns the axes of the picture."""
@@ -62,7 +55,7 @@ class CompareTest(FolderTest):
 
         picture = self.folder / 'curves.png'
         with mock.patch.object(pyplot, 'close'):
-            self.run_program(name, job, *arguments, '--picture', str(picture))
+            self.run_program(name, job, *arguments, '--picture', picture)
         axes = pyplot.gcf().axes
         pyplot.close('all')
         self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
@@ -95,14 +88,14 @@ class CompareTest(FolderTest):
     def test_tables(self):
         trained, out = self.run_program('hierarchy', self.hierarchy, '--seeds', '1', '2')
         self.assertLen(trained, 8)
-        self.assertIn(
-            'median distance along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out
-        )
+        self.assertIn('along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out)
         self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
         (self.folder / 'found.json').unlink()
-        trained, out = self.run_program(
-            'limits', lambda cell, seed, _: {'normalized_return': 0.1 * len(cell), 'curve': []}
-        )
+
+        def limited(cell, seed, samples):
+            return {'normalized_return': 0.1 * len(cell), 'curve': []}
+
+        trained, out = self.run_program('limits', limited)
         self.assertLen(trained, 11)  # muscles have no realistic limits but their strength
         self.assertIn('| ideal | 1.40 | 1.20 | 1.40 | 1.20 |', out)
         self.assertIn('| realistic | 1.80 | 1.60 | 1.80 | 1.20 |', out)
@@ -124,10 +117,8 @@ class CompareTest(FolderTest):
         (compare.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
     )
     def test_a_run_has_the_settings_of_its_action(self, trainer, action, expected):
-        asked, result = (
-            [],
-            {'distance': 3.0, 'distance_interval': [], 'median_distance': 2, 'speed': 1},
-        )
+        result = {'distance': 3.0, 'distance_interval': [], 'median_distance': 2, 'speed': 1}
+        asked = []
 
         def train(id_, seed, own, folder, threads):
             asked.append(own)
@@ -166,7 +157,7 @@ class CompareTest(FolderTest):
         self.assertEqual(set(asked), {compare.TASKS['soccer'][compare.KINDS.index(kind)]})
 
 
-class JobsTest(parameterized.TestCase):
+class JobsTest(FolderTest):
     @parameterized.parameters(
         ({}, 'policy'),
         ({'stages': [[0.0, {}]]}, 'last'),
@@ -174,28 +165,26 @@ class JobsTest(parameterized.TestCase):
         ({'cloned': 60.0}, 'policy'),
     )
     def test_policy_of_a_run(self, own, name):
-        folder = self.enterContext(tempfile.TemporaryDirectory())
+        id_ = 'PD_Biped2D_Flat-v0'
         curve = {'settings': {'samples': 100.0, **own}}
-        pathlib.Path(folder, 'curve.json').write_text(json.dumps(curve))
+        (self.folder / 'curve.json').write_text(json.dumps(curve))
+        policy = policies.reference(id_)
         for number, each in enumerate(('policy', 'last')):
-            policy = policies.reference('PD_Biped2D_Flat-v0')
-            info = {**policy.info, 'samples': number}
-            policies.save(
-                dataclasses.replace(policy, info=info), pathlib.Path(folder, f'{each}.npz')
-            )
+            changed = dataclasses.replace(policy, info={**policy.info, 'samples': number})
+            policies.save(changed, self.folder / f'{each}.npz')
         with mock.patch.object(train_all.evaluation, 'evaluate', return_value={}):
-            run = train_all.measured('PD_Biped2D_Flat-v0', pathlib.Path(folder), '', 0.0)
+            run = train_all.measured(id_, self.folder, '', 0.0)
         self.assertEqual(run.entry['shipped_at'], ('policy', 'last').index(name))
 
     def test_every_environment_is_trained_but_for_most_gaits(self):
-        ids = {id_ for id_, _ in train_all.jobs('*')}
+        """Actuation models, of biped, dog and raptor, are compared with three seeds."""
+        jobs = list(train_all.jobs('*'))
         gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.task_type == 'gait'}
-        self.assertEqual(ids, set(catalogue.BY_ID) - gaits | set(train_all.GAITS))
-
-    def test_actuation_models_are_compared_with_three_seeds(self):
-        """Twelve cells: torque, velocity, position and muscle, of biped, dog and raptor."""
-        again = {id_ for id_, seed in train_all.jobs('*') if seed == 3}
-        self.assertLen(again, 12)
+        self.assertEqual(
+            {id_ for id_, _ in jobs}, set(catalogue.BY_ID) - gaits | set(train_all.GAITS)
+        )
+        again = {id_ for id_, seed in jobs if seed == 3}
+        self.assertLen(again, 12)  # torque, velocity, position and muscle
         self.assertLen([id_ for id_ in again if id_.startswith('MTU_')], 3)
 
     def test_policies_that_a_run_uses_are_trained_before(self):
@@ -220,23 +209,22 @@ class JobsTest(parameterized.TestCase):
             raise ValueError('no network')
 
         self.enterContext(mock.patch.object(train_all, 'in_processes', lambda _: work))
-        folder = self.enterContext(tempfile.TemporaryDirectory())
-        self.enterContext(mock.patch.dict(os.environ, TRL_SUITE_TRAINED=folder))
-        out = self.enterContext(contextlib.redirect_stdout(io.StringIO()))
-        self.enterContext(contextlib.redirect_stderr(io.StringIO()))
-        with self.assertRaisesRegex(RuntimeError, '4 of 4 runs failed'):
-            train_all.main(['--filter', 'PD_Biped2D_[FI]*'])
+        self.enterContext(mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)))
+
+        def train():
+            with self.assertRaisesRegex(RuntimeError, '4 of 4 runs failed'):
+                train_all.main(['--filter', 'PD_Biped2D_[FI]*'])
+
+        out = output(train)
         self.assertLen(done, 3)
         self.assertNotIn(incline, done)
-        self.assertIn(f'{flat:40}    1  ValueError: no network', out.getvalue())
-        self.assertIn(f'{incline:40}    1  RuntimeError: not trained, since', out.getvalue())
+        self.assertIn(f'{flat:40}    1  ValueError: no network', out)
+        self.assertIn(f'{incline:40}    1  RuntimeError: not trained, since', out)
 
     def test_a_run_in_progress_is_not_overwritten(self):
-        output = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-        folder = output / 'PD_Biped2D_Flat-v0' / 'seed_1'
-        work = train_all.in_processes(
-            train_all.parsed(['--runs', str(output), '--overwrite', '--samples', '1'])
-        )
+        folder = self.folder / 'PD_Biped2D_Flat-v0' / 'seed_1'
+        arguments = ['--runs', str(self.folder), '--overwrite', '--samples', '1']
+        work = train_all.in_processes(train_all.parsed(arguments))
         with (
             runs.only_run(folder),
             self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
@@ -244,49 +232,40 @@ class JobsTest(parameterized.TestCase):
             work('PD_Biped2D_Flat-v0', 1)
         self.assertTrue(folder.exists())
 
-    def test_files_that_a_run_reads(self):
+    @parameterized.parameters(
+        ('PD_Biped2D_Incline-v0', 'PD_Biped2D_Flat-v0'),
+        ('PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_General_Step-v0'),
+    )
+    def test_files_that_a_run_reads(self, *expected):
         """The policies of the start and of the controller, and which environments share them."""
-        for id_, expected in (
-            ('PD_Biped2D_Incline-v0', {'PD_Biped2D_Incline-v0', 'PD_Biped2D_Flat-v0'}),
-            (
-                'PD_Biped3D_HLC_Soccer-v0',
-                {'PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_General_Step-v0'},
-            ),
-        ):
-            given = train_all.given(id_)
-            self.assertEqual(given.keys(), {f'{each}.npz' for each in expected} | {'shared.json'})
-            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-            for name, content in given.items():
-                (folder / name).write_bytes(content)
-            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
-                self.assertEqual(set(policies.available()), expected)
-                VectorEnvironment(id_, 1, 1, 0).close()
+        given = train_all.given(expected[0])
+        self.assertCountEqual(given, [*(f'{each}.npz' for each in expected), 'shared.json'])
+        for name, content in given.items():
+            (self.folder / name).write_bytes(content)
         self.assertGreater(len(policies.available()), 50)
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+            self.assertEqual(set(policies.available()), set(expected))
+            VectorEnvironment(expected[0], 1, 1, 0).close()
 
-    def test_a_better_run_replaces_the_policy_of_another_environment(self):
+    @parameterized.parameters((20.0, False), (22.0, True))
+    def test_a_better_run_replaces_the_policy_of_another_environment(self, returned, better):
         id_, other = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0'
-        for returned, used in ((20.0, other), (22.0, id_)):
-            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
-            entry = {'policy': other, 'evaluation': {'return': 21.0}}
-            (folder / policies.SHARED).write_text(json.dumps({id_: entry}))
-            run = train_all.Run(
-                {'seed': 1, 'settings': {}, 'evaluation': {'return': returned}},
-                policies.reference(id_), 'here', 1.0,
-            )  # fmt: skip
-            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
-                train_all.enter(id_, 1, run)
-                self.assertEqual(policies.trained_for(id_), used)
-                self.assertIn(id_, policies.available())
+        entry = {'policy': other, 'evaluation': {'return': 21.0}}
+        (self.folder / policies.SHARED).write_text(json.dumps({id_: entry}))
+        entry = {'seed': 1, 'settings': {}, 'evaluation': {'return': returned}}
+        run = train_all.Run(entry, policies.reference(id_), 'here', 1.0)
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+            train_all.enter(id_, 1, run)
+            self.assertEqual(policies.trained_for(id_), id_ if better else other)
+            self.assertIn(id_, policies.available())
 
     def test_a_policy_that_others_use_is_kept(self):
-        folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         for id_ in 'abcd':
-            (folder / f'{id_}.npz').touch()
-        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
-            share_gaits.remove_unused(
-                {'b': {'policy': 'a'}, 'c': {'policy': 'b'}, 'e': {'policy': 'd'}}
-            )
-        self.assertCountEqual([path.stem for path in folder.iterdir()], 'abd')
+            (self.folder / f'{id_}.npz').touch()
+        used = {'b': {'policy': 'a'}, 'c': {'policy': 'b'}, 'e': {'policy': 'd'}}
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+            share_gaits.remove_unused(used)
+        self.assert_only('a.npz', 'b.npz', 'd.npz')
 
     def test_the_best_preference_is_selected(self):
         id_ = 'FSM_Raptor2D_Terrain_Mixed-v0'
@@ -296,11 +275,10 @@ class JobsTest(parameterized.TestCase):
             added = float((candidate.biases[-1] - policy.biases[-1]).max())
             return {'distance': -abs(added - 1.25)}
 
-        with (
-            mock.patch.object(share_gaits.evaluation, 'evaluate', evaluate),
-            contextlib.redirect_stdout(io.StringIO()),
-        ):
-            preference, best = share_gaits.preferring(id_, policy, [0, 1, 3], 1, 1)
+        with mock.patch.object(share_gaits.evaluation, 'evaluate', evaluate):
+            found = []
+            output(lambda: found.extend(share_gaits.preferring(id_, policy, [0, 1, 3], 1, 1)))
+        preference, best = found
         self.assertEqual(preference, 1)
         np.testing.assert_array_equal(best.biases[-1], policy.with_preference(1).biases[-1])
 
@@ -351,10 +329,8 @@ class RandomizedTest(parameterized.TestCase):
         preset = train_randomized.preset(entry)
         least = before[preset]['return'] - before[preset]['return_interval']
         self.assertGreater(found[preset], least)
-        policy, options = (
-            policies.reference(id_, 'randomized'),
-            train_randomized.CONDITIONS['robot'],
-        )
+        policy = policies.reference(id_, 'randomized')
+        options = train_randomized.CONDITIONS['robot']
         environments = VectorEnvironment(id_, 1, 1, 0, task_kwargs=options)
         self.addCleanup(environments.close)
         policy.check(environments)
@@ -369,12 +345,8 @@ class GeneralistTest(FolderTest):
         ids = generalist.ids_of('biped2d')
         short = generalist.Settings(distilled=1600, rounds=2, epochs=20, each=2)
         ppo_ = {
-            **short.ppo,
-            'samples': 1000,
-            'averaged': 500,
-            'value_first': 500,
-            'evaluate_every': 1,
-        }
+            **short.ppo, 'samples': 1000, 'averaged': 500, 'value_first': 500, 'evaluate_every': 1,
+        }  # fmt: skip
         short = dataclasses.replace(short, ppo=ppo_)
         with contextlib.redirect_stderr(io.StringIO()):
             distilled, policy, curve = generalist.train(ids, 0, short, self.folder)
@@ -402,10 +374,8 @@ class GeneralistTest(FolderTest):
         self.assertContainsSubset(ids, policies.available('generalist'))
         entry = runs.read(f'generalist/{ids[-2]}.json')
         self.assertEqual(entry['ids'], ids)
-        self.assertEqual(
-            entry['settings'],
-            json.loads(json.dumps(dataclasses.asdict(generalist.SETTINGS[character]))),
-        )
+        expected = dataclasses.asdict(generalist.SETTINGS[character])
+        self.assertEqual(entry['settings'], json.loads(json.dumps(expected)))
         policy = policies.reference(ids[0], 'generalist')
         for id_ in ids[:2]:  # flat ground and an incline, where episodes are alike
             own = entry[entry['shipped']][id_]['return']
@@ -430,9 +400,9 @@ class FootstepsTest(parameterized.TestCase):
         self.assertLess(found['landing'], error)
 
 
-class PageTest(absltest.TestCase):
+class PageTest(FolderTest):
     def test_text_between_marks(self):
-        page = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()), 'page.md')
+        page = self.folder / 'page.md'
         page.write_text('before\n<a>\nold\n</a>\nafter\n')
         files.replace_between(page, '<a>', '</a>', r'new \1')
         self.assertEqual(page.read_text(), 'before\n<a>\nnew \\1\n</a>\nafter\n')
@@ -443,14 +413,19 @@ class PageTest(absltest.TestCase):
             self.assertEqual(page.read_text(), text)
 
 
-class TrimTest(absltest.TestCase):
+def policy_of_five(**fields):
+    return policies.Policy(**{
+        'id': 'PD_Biped2D_Flat-v0', 'blocks': (('a', 5),), 'actions': ('x', 'y'),
+        'quantity': 'target angle', 'clip': 10, 'biases': [[0, 0]], 'log_std': [0, 0], **fields,
+    })  # fmt: skip
+
+
+class TrimTest(FolderTest):
     def test_only_what_was_always_0_is_left_out(self):
         rng = np.random.default_rng(0)
-        policy = policies.Policy(
-            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
-            mean=[0, 0.5, 0, 0], std=[1, 0.01, 0.01, 2], clip=10, activation='tanh',
-            columns=[4, 3, 1, 0], weights=[rng.normal(size=(4, 2))], biases=[[0, 0]],
-            log_std=[0, 0],
+        policy = policy_of_five(
+            mean=[0, 0.5, 0, 0], std=[1, 0.01, 0.01, 2], activation='tanh', columns=[4, 3, 1, 0],
+            weights=[rng.normal(size=(4, 2))],
         )  # fmt: skip
         trimmed = networks.trimmed(policy)
         self.assertEqual(trimmed.columns.tolist(), [4, 3, 0])  # a constant counts
@@ -464,10 +439,9 @@ class TrimTest(absltest.TestCase):
         line = policies.Convolution(
             line=4, strides=(2,), weights=[rng.normal(size=(2, 1, 3))], biases=[np.zeros(3)]
         )
-        policy = policies.Policy(
-            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
-            mean=np.zeros(5), std=[1, 1, 1, 0.01, 1], clip=10, activation='relu',
-            weights=[rng.normal(size=(7, 2))], biases=[[0, 0]], log_std=[0, 0], convolution=line,
+        policy = policy_of_five(
+            mean=np.zeros(5), std=[1, 1, 1, 0.01, 1], activation='relu', convolution=line,
+            weights=[rng.normal(size=(7, 2))],
         )  # fmt: skip
         trimmed = networks.trimmed(policy)
         observation = rng.normal(size=(9, 5)) / 30
@@ -489,11 +463,10 @@ class TrimTest(absltest.TestCase):
         settings = train_all.settings(id_)
         old = {**settings, 'first': dict(settings['first']), 'removed': 1}
         del old['retry'], old['first']['members']
-        with tempfile.TemporaryDirectory() as folder:
-            path = pathlib.Path(folder) / f'{id_}.json'
-            path.write_text(json.dumps({'id': id_, 'shipped': 1, 'runs': [{'settings': old}]}))
-            with mock.patch.dict('os.environ', TRL_SUITE_TRAINED=folder):
-                [run] = train_all.entries(id_)
+        text = json.dumps({'id': id_, 'shipped': 1, 'runs': [{'settings': old}]})
+        (self.folder / f'{id_}.json').write_text(text)
+        with mock.patch.dict('os.environ', TRL_SUITE_TRAINED=str(self.folder)):
+            [run] = train_all.entries(id_)
         default = train_all.refine_gaits.Settings()
         expected = {**settings, 'retry': default.retry}
         expected['first'] = {**settings['first'], 'members': default.first.members}
@@ -617,21 +590,21 @@ class ExpertTest(parameterized.TestCase):
         self.assertLess(np.linalg.norm(aim), 2.0)
 
     @parameterized.parameters(
-        ('PD_Biped3D_HLC_Soccer-v0', {}),
-        ('PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}),
-        ('PD_Biped2D_Flat-v0', {}),
-    )
-    def test_expert_rejects_unsupported_tasks(self, id_, options):
+        ('expert', 'PD_Biped3D_HLC_Soccer-v0'), ('joint_expert', 'PD_Biped3D_HLC_Forest-v0'),
+        ('expert', 'PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}),
+        ('expert', 'PD_Biped2D_Flat-v0'),
+    )  # fmt: skip
+    def test_unsupported_tasks_are_refused(self, name, id_, options=None):
         environments = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
-        with self.assertRaisesRegex(ValueError, 'the expert does not support the task'):
-            expert.expert(environments)
+        message = f'the {name.replace("_", " ")} does not support the task'
+        with self.assertRaisesRegex(ValueError, message):
+            getattr(expert, name)(environments)
 
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
     def test_expert_arrives_on_difficult_ground(self, name):
         """20 s of 8 episodes, towards goals at the least speed required of trained policies."""
-        environments = VectorEnvironment(
-            f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled'
-        )
+        id_ = f'PD_Biped3D_HLC_{name}-v0'
+        environments = VectorEnvironment(id_, 8, 0, seed=3, autoreset='disabled')
         policy, observation = expert.expert(environments), environments.reset()
         fell, speed = 0, np.zeros(8)
         for _ in range(40):
@@ -652,14 +625,8 @@ class JointExpertTest(parameterized.TestCase):
     @parameterized.parameters('Trail', 'Blocks', 'Soccer')
     def test_walks_on(self, name):
         """10 s of 8 episodes: at most one fall, and the walkers leave their start."""
-        environments = VectorEnvironment(
-            f'PD_Biped3D_Terrain_{name}_Hard-v0',
-            8,
-            0,
-            seed=3,
-            autoreset='disabled',
-            step_limit=None,
-        )
+        id_, options = f'PD_Biped3D_Terrain_{name}_Hard-v0', {'autoreset': 'disabled'}
+        environments = VectorEnvironment(id_, 8, 0, seed=3, step_limit=None, **options)
         policy, observation = expert.joint_expert(environments), environments.reset()
         fell, distance = 0, np.zeros(8)
         for _ in range(300):
@@ -668,29 +635,18 @@ class JointExpertTest(parameterized.TestCase):
             step = environments.step(action)
             fell += step.terminated.sum()
             distance = np.maximum(distance, step.info['distance'])
-            observation = (
-                environments.reset(step.terminated) if step.terminated.any() else step.observation
-            )
+            ended = step.terminated
+            observation = environments.reset(ended) if ended.any() else step.observation
         self.assertLessEqual(fell, 1)
         self.assertGreater(distance.mean(), 1.0 if name == 'Soccer' else 5.0)
 
     def test_plans_again_after_a_reset(self):
         """A policy that has seen other episodes acts in a new one as a new policy does."""
-        environments = VectorEnvironment(
-            'PD_Biped3D_Terrain_Soccer_Hard-v0', 2, 0, seed=3, autoreset='disabled'
-        )
+        id_ = 'PD_Biped3D_Terrain_Soccer_Hard-v0'
+        environments = VectorEnvironment(id_, 2, 0, seed=3, autoreset='disabled')
         used, observation = expert.joint_expert(environments), environments.reset()
         for _ in range(20):
             observation = environments.step(used(observation)).observation
         observation = environments.reset()
         fresh = expert.joint_expert(environments)
         np.testing.assert_array_equal(used(observation), fresh(observation))
-
-    def test_rejects_unsupported_tasks(self):
-        environments = VectorEnvironment('PD_Biped3D_HLC_Forest-v0', 1, 1, seed=0)
-        with self.assertRaisesRegex(ValueError, 'the joint expert does not support the task'):
-            expert.joint_expert(environments)
-
-
-if __name__ == '__main__':
-    absltest.main()

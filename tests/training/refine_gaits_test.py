@@ -2,20 +2,18 @@
 
 import dataclasses
 import json
-import pathlib
-import tempfile
 from unittest import mock
 
 import learn_gaits
 import numpy as np
 import refine_gaits
 import torch
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
+from helpers import FolderTest
 
 from trl_suite import policies
-from trl_suite.vector import VectorEnvironment
 
-from .learn_gaits_test import HOPPER, TINY, WALLS
+from .learn_gaits_test import HOPPER, TINY, WALLS, trained_in_parts
 
 FIRST = dataclasses.replace(TINY, samples=16, expert_cycles=0, members=2)
 SMALL = refine_gaits.Settings(
@@ -30,13 +28,11 @@ def make(**changes):
     for _ in range(6):
         learner.advance()
     learner.finish()
-    initial = learner.exported()
-    return refine_gaits.Refiner(
-        HOPPER, 1, dataclasses.replace(SMALL, **changes), 1, initial
-    ), initial
+    initial, settings = learner.exported(), dataclasses.replace(SMALL, **changes)
+    return refine_gaits.Refiner(HOPPER, 1, settings, 1, initial), initial
 
 
-class RefineTest(parameterized.TestCase):
+class RefineTest(FolderTest):
     @parameterized.parameters(*refine_gaits.CHANGES)
     def test_it_begins_with_the_mean_values_of_the_initial_policy(self, changes):
         refiner, initial = make(changes=changes)
@@ -52,19 +48,19 @@ class RefineTest(parameterized.TestCase):
         np.testing.assert_array_equal(exported(observation), initial(observation))
 
     @parameterized.parameters(
-        ({'first': dataclasses.replace(FIRST, action='both')}, 'action'),
+        ({'first': dataclasses.replace(FIRST, action='both')}, "action.*'both'; expected 'discrete'"),
         ({'changes': 'every'}, "unknown kind of changes 'every'"),
         ({'also': ('FSM_Hoper2D_*',)}, 'did you mean'),
         ({'also': ('PD_Biped2D_Gaps_Terrain-v0',)}, 'no gait'),
-    )
-    def test_bad_settings_are_refused_before_q_learning(self, changes, message):
+        ({}, 'PD_Biped2D_Flat-v0 has no gait', 'PD_Biped2D_Flat-v0'),
+    )  # fmt: skip
+    def test_bad_settings_are_refused_before_q_learning(self, changes, message, id_=HOPPER):
         settings = dataclasses.replace(SMALL, **changes)
         with (
-            tempfile.TemporaryDirectory() as name,
             mock.patch.object(learn_gaits, 'train', side_effect=AssertionError),
             self.assertRaisesRegex(ValueError, message),
         ):
-            refine_gaits.train(HOPPER, 1, settings, pathlib.Path(name), 1)
+            refine_gaits.train(id_, 1, settings, self.folder, 1)
 
     def test_actions_are_drawn_with_their_probabilities(self):
         refiner, _ = make(num_envs=8, horizon=1)
@@ -111,8 +107,8 @@ class RefineTest(parameterized.TestCase):
     @parameterized.parameters('all', 'each')
     def test_it_learns_changes_that_pay_at_a_constant_divergence(self, changes):
         refiner, initial = make(
-            num_envs=16, value_first=0, horizon=16, changes=changes, changes_first=np.inf, kl=1.0,
-            averaged=0.0,
+            num_envs=16, value_first=0, horizon=16, minibatch=64, changes=changes,
+            changes_first=np.inf, kl=1.0, averaged=0.0,
         )  # fmt: skip
         choices = refiner.learner.choices
 
@@ -176,58 +172,30 @@ class RefineTest(parameterized.TestCase):
         {}, {'also': (WALLS,), 'averaged': 96.0}, {'changes': 'each', 'changes_first': 48.0}
     )
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
-        curves = []
-        with tempfile.TemporaryDirectory() as name:
-            folders = [pathlib.Path(name) / each for each in 'ab']
-            for folder, samples in zip(folders, ((64,), (32, 64)), strict=True):
-                for each in samples:
-                    settings = dataclasses.replace(
-                        SMALL, samples=each, last_learning_rate=SMALL.learning_rate, **changes
-                    )
-                    curve = refine_gaits.train(HOPPER, 1, settings, folder, 1)
-                curves.append([{**point, 'seconds': None} for point in curve])
-            self.assertEqual(*curves)
-            self.assertEqual(*((folder / 'policy.npz').read_bytes() for folder in folders))
-            written = json.loads((folders[0] / 'curve.json').read_text())
-            points = [point['samples'] for point in written['curve']]
-            self.assertEqual(points, [16, 48, 80])  # Q-learning first
-            self.assertEqual(points, [point['samples'] for point in curves[0]])
-            with mock.patch.object(learn_gaits, 'train', side_effect=AssertionError):
-                again = refine_gaits.train(HOPPER, 1, settings, folders[0], 1)
-            self.assertEqual([{**point, 'seconds': None} for point in again], curves[0])
-            policy = policies.load(folders[0] / 'policy.npz')
-            policy.check(VectorEnvironment(HOPPER, 1, 1))
-            self.assertEqual(policy.info['samples'], 80)
-            with self.assertRaisesRegex(ValueError, 'other settings'):
-                other = dataclasses.replace(settings, gamma=0.9)
-                refine_gaits.train(HOPPER, 1, other, folders[0], 1)
+        settings = dataclasses.replace(SMALL, last_learning_rate=SMALL.learning_rate, **changes)
+        train = refine_gaits.train
+        folder, curve, policy = trained_in_parts(self, train, settings, (32, 64), ('policy.npz',))
+        written = json.loads((folder / 'curve.json').read_text())
+        points = [point['samples'] for point in written['curve']]
+        self.assertEqual(points, [16, 48, 80])  # Q-learning first
+        self.assertEqual(points, [point['samples'] for point in curve])
+        settings = dataclasses.replace(settings, samples=64)
+        with mock.patch.object(learn_gaits, 'train', side_effect=AssertionError):
+            again = train(HOPPER, 1, settings, folder, 1)
+        self.assertEqual([{**point, 'seconds': None} for point in again], curve)
+        self.assertEqual(policy.info['samples'], 80)
+        with self.assertRaisesRegex(ValueError, 'other settings'):
+            train(HOPPER, 1, dataclasses.replace(settings, gamma=0.9), folder, 1)
 
-    def test_other_actions_and_environments_are_refused(self):
-        actors = dataclasses.replace(FIRST, action='both')
-        with self.assertRaisesRegex(ValueError, "'both'; expected 'discrete'"):
-            make(first=actors)
-        with self.assertRaisesRegex(ValueError, 'PD_Biped2D_Flat-v0 has no gait'):
-            refine_gaits.train(
-                'PD_Biped2D_Flat-v0',
-                1,
-                SMALL,
-                pathlib.Path(self.enterContext(tempfile.TemporaryDirectory())),
-                1,
-            )
+    def test_an_initial_policy_of_another_environment_is_refused(self):
         initial = policies.reference('FSM_Dog2D_Terrain_Mixed-v0')
         with self.assertRaisesRegex(ValueError, 'FSM_Dog2D_Terrain_Mixed-v0'):
             refine_gaits.Refiner(HOPPER, 1, SMALL, 1, initial)
 
     def test_a_run_begins_with_a_file(self):
-        _, initial = make()
-        with tempfile.TemporaryDirectory() as name:
-            path = pathlib.Path(name) / 'initial.npz'
-            policies.save(initial, path)
-            settings = dataclasses.replace(SMALL, start=str(path), samples=32)
-            curve = refine_gaits.train(HOPPER, 1, settings, pathlib.Path(name) / 'run', 1)
-            self.assertEqual([point['samples'] for point in curve], [32])
-            self.assertFalse((pathlib.Path(name) / 'run' / 'first').exists())
-
-
-if __name__ == '__main__':
-    absltest.main()
+        path = self.folder / 'initial.npz'
+        policies.save(make()[1], path)
+        settings = dataclasses.replace(SMALL, start=str(path), samples=32)
+        curve = refine_gaits.train(HOPPER, 1, settings, self.folder / 'run', 1)
+        self.assertEqual([point['samples'] for point in curve], [32])
+        self.assertFalse((self.folder / 'run' / 'first').exists())

@@ -92,7 +92,3 @@ class TuneTest(absltest.TestCase):
         np.testing.assert_array_less(0.02, np.diff(length))
         self.assertLess(length[0], 0.6)
         self.assertGreater(length[-1], 2.2)
-
-
-if __name__ == '__main__':
-    absltest.main()
