@@ -70,11 +70,11 @@ class EvaluateTest(parameterized.TestCase):
 
     def test_results_do_not_depend_on_threads_and_chunks(self):
         policy = make(GAPS)
-        expected = evaluation.evaluate(GAPS, policy, 7, 2, num_threads=1)
+        expected = evaluation.evaluate(GAPS, policy, 4, 2, num_threads=1)
         self.assertLessEqual(machine.made_with().items(), expected.items())
-        self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2, num_threads=2), expected)
+        self.assertEqual(evaluation.evaluate(GAPS, policy, 4, 2, num_threads=2), expected)
         with mock.patch.object(evaluation, 'CHUNK', 3):
-            self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2), expected)
+            self.assertEqual(evaluation.evaluate(GAPS, policy, 4, 2), expected)
         fewer = evaluation.evaluate(GAPS, policy, 3, 2)
         for name in LISTS:
             self.assertEqual(fewer[name], expected[name][:3])
@@ -98,12 +98,12 @@ class EvaluateTest(parameterized.TestCase):
         pickling = Pickling()
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
             for policy, factory in ((make(GAPS), False), (evaluation.random, True)):
-                expected = evaluation.evaluate(GAPS, policy, 7, 2, factory=factory)
+                expected = evaluation.evaluate(GAPS, policy, 4, 2, factory=factory)
                 for executor in (pickling, pool):
                     options = {'factory': factory, 'executor': executor}
-                    found = evaluation.evaluate(GAPS, policy, 7, 2, **options)
+                    found = evaluation.evaluate(GAPS, policy, 4, 2, **options)
                     self.assertEqual(found, expected)
-        self.assertLen(pickling.sent, 2 * 3)
+        self.assertLen(pickling.sent, 2 * 2)
         self.assertLess(max(pickling.sent), 1e5)  # a policy, and no environment
 
     def test_several_policies(self):
