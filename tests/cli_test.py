@@ -17,7 +17,7 @@ from unittest import mock
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import KINDS, besides_notices
 from programs import GAPS, CommandTest, policy_for, run
 
@@ -514,14 +514,13 @@ class CompileTest(CommandTest):
 
 
 class TerrainTest(CommandTest):
-    @parameterized.parameters(('gaps', 0), ('stairs3d', 1))  # below each other, side by side
-    def test_presets(self, name, axis):
-        found = self.output('terrain', name, '--length', '12')
-        self.assertEqual(found, f'terrain_{name}.png\n')
-        self.output('terrain', name, '--draws', '1', '--length', '12', '--output', 'b.png')
-        one, three = iio.imread('b.png'), iio.imread(f'terrain_{name}.png')
-        self.assertLess(one.shape[axis], three.shape[axis])
-        self.assert_only(f'terrain_{name}.png', 'b.png')
+    def test_a_preset(self):
+        found = self.output('terrain', 'gaps', '--length', '12')
+        self.assertEqual(found, 'terrain_gaps.png\n')
+        self.output('terrain', 'gaps', '--draws', '1', '--length', '12', '--output', 'b.png')
+        one, three = iio.imread('b.png'), iio.imread('terrain_gaps.png')
+        self.assertLess(one.shape[0], three.shape[0])
+        self.assert_only('terrain_gaps.png', 'b.png')
 
     def test_a_policy_file(self):
         (self.folder / 'own').mkdir()
@@ -588,10 +587,11 @@ class ProgramTest(CommandTest):
         self.assertRegex(done.stderr, f'^trl-suite: error: [^\n]*{message}[^\n]*\n$')
 
     def test_without_opengl(self):
-        done = self.program('rollout', GAPS, '--video', 'a.mp4', MUJOCO_GL='disable')
+        without = {'MUJOCO_GL': 'disable', 'NUMBA_DISABLE_JIT': '1'}
+        done = self.program('rollout', GAPS, '--video', 'a.mp4', **without)
         self.assert_one_error(done, "cannot render.* is 'disable'")
         self.assert_only()
-        done = self.program('rollout', GAPS, '--steps', '5', MUJOCO_GL='disable')
+        done = self.program('rollout', GAPS, '--steps', '5', **without)
         self.assertEqual((done.returncode, done.stderr), (0, ''))  # nothing is rendered
 
     def test_a_broken_library_or_a_wrong_name(self):
@@ -663,7 +663,3 @@ class PagesTest(CommandTest):
                 short = (*SIZE, '--steps', '8') if command.startswith('rollout') else ()
                 self.output(*shlex.split(command), *short)
         self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4')
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -8,7 +8,7 @@ from unittest import mock
 
 import numpy as np
 import own_test
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import write_terrainrl
 from PIL import Image
 from programs import GAPS, CommandTest, run
@@ -272,7 +272,3 @@ class ClipTest(CommandTest):
         ):
             self.assert_refused(message, 'clip', *arguments)
         self.assert_only(*here)
-
-
-if __name__ == '__main__':
-    absltest.main()

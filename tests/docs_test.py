@@ -368,7 +368,3 @@ class SiteTest(absltest.TestCase):
             for below in conf.navigation(page.removesuffix('.md')).splitlines()[3:-1]:
                 listed.add(folder.joinpath(below).resolve().relative_to(DOCS).as_posix())
         self.assertEqual(pages - listed - {'README.md', 'index.md'}, set())
-
-
-if __name__ == '__main__':
-    absltest.main()

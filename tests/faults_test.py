@@ -40,7 +40,7 @@ FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '10'))  # rounds
 SEQUENCE = sequences.Sequence('two', ('plaid/dog_flat', 'plaid/dog_steps'))
 SETTINGS = Settings(
-    samples=512, num_envs=8, horizon=8, minibatch=32, hidden=(16, 16), evaluate_every=128,
+    samples=256, num_envs=8, horizon=8, minibatch=32, hidden=(16, 16), evaluate_every=128,
     evaluation_episodes=2,
 )  # fmt: skip
 SIGNALS = signal.SIGKILL, signal.SIGINT, signal.SIGTERM

@@ -1,6 +1,7 @@
 """Trained policies: what they compute, what they refuse, their files, and those shipped."""
 
 import dataclasses
+import functools
 import io
 import itertools
 import json
@@ -39,34 +40,26 @@ def make(seed=0, blocks=SIZES, hidden=(6, 5), actions=('hip', 'knee'), **changes
     return policies.Policy(**{**fields, **changes})
 
 
-def make_convolving(seed=0, size=0.6, origin=9, **changes):
-    """A policy with convolutions over 9 heights, relative to the first of 4 other inputs."""
+def make_convolving(seed=0, size=0.6, origin=9, grid=None, **changes):
+    """A policy with convolutions over 9 heights, relative to the first of 4 other inputs.
+
+    With `grid`, over two maps of that size instead, which are followed by 4 other inputs.
+    """
     rng = np.random.default_rng(seed)
-    shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
-    line = policies.Convolution(
-        line=9, strides=(2, 1), weights=[rng.normal(0, size, shape) for shape in shapes],
-        biases=[rng.normal(0, 0.3, shape[2]) for shape in shapes], origin=origin,
+    if grid is None:
+        line, shapes, outputs = 9, ((3, 1, 4), (2, 4, 5)), 3 * 5  # 9 heights -> 4 positions -> 3
+    else:  # positions: 5 x 6 -> 2 x 2 -> 1 x 2
+        line, shapes, outputs = 60, ((2, 3, 2, 4), (2, 1, 4, 3)), 1 * 2 * 3
+    convolution = policies.Convolution(
+        line=line, strides=(2, 1), weights=[rng.normal(0, size, shape) for shape in shapes],
+        biases=[rng.normal(0, 0.3, shape[-1]) for shape in shapes], origin=origin, grid=grid,
     )  # fmt: skip
-    sizes = (3 * 5 + 4, 6, 5, 2)
-    weights = [rng.normal(0, 0.6, pair) for pair in itertools.pairwise(sizes)]
-    return make(
-        seed, blocks=(('terrain', 9), ('pose', 4)), weights=weights, convolution=line, **changes
-    )
+    pairs = itertools.pairwise((outputs + 4, 6, 5, 2))
+    weights, blocks = [rng.normal(0, 0.6, pair) for pair in pairs], (('terrain', line), ('pose', 4))
+    return make(seed, blocks, weights=weights, convolution=convolution, **changes)
 
 
-def make_seeing(seed=0, **changes):
-    """A policy with convolutions over two maps of 5 by 6, followed by 4 other inputs."""
-    rng = np.random.default_rng(seed)
-    shapes = (2, 3, 2, 4), (2, 1, 4, 3)  # positions: 5 x 6 -> 2 x 2 -> 1 x 2
-    maps = policies.Convolution(
-        line=60, strides=(2, 1), weights=[rng.normal(0, 0.4, shape) for shape in shapes],
-        biases=[rng.normal(0, 0.3, shape[-1]) for shape in shapes], grid=(5, 6),
-    )  # fmt: skip
-    sizes = (1 * 2 * 3 + 4, 6, 5, 2)
-    weights = [rng.normal(0, 0.6, pair) for pair in itertools.pairwise(sizes)]
-    return make(
-        seed, blocks=(('terrain', 60), ('pose', 4)), weights=weights, convolution=maps, **changes
-    )
+make_seeing = functools.partial(make_convolving, size=0.4, origin=None, grid=(5, 6))
 
 
 def selecting(seed, count, outputs):
@@ -691,7 +684,3 @@ class ShippedTest(parameterized.TestCase):
         clip = motion.load(catalogue.BY_ID[id_].clip)
         whole = clip.speed * found['step_limit'] / 30  # m; as the clip goes
         self.assertGreater(np.median(distances), 0.7 * whole)
-
-
-if __name__ == '__main__':
-    absltest.main()
