@@ -99,6 +99,7 @@ class ViewTest(CommandTest):
                 seen.append(page.status)
             with self.assertRaises(urllib.error.HTTPError) as refused:
                 urllib.request.urlopen(viewer.url[:-1])
+            refused.exception.close()  # the server would wait for it
             seen.extend([refused.exception.code, viewer._panel._status.content, viewer])
             notices._say('compiling')
             seen.append(viewer._panel._status.content)
