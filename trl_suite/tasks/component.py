@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -65,10 +64,10 @@ class Component:
         self.info_arrays: dict[str, Any] = {}
         return outcome
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        """Draws what varies between episodes, from a seed for each of some simulations.
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        """Draws what varies between episodes of a simulation.
 
-        All components get the same seeds; they derive their own with different spawn keys.
+        All components get the same seed; they derive their own with different spawn keys.
         """
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:

@@ -190,9 +190,10 @@ class Task(composer.Task):
             self.reset(env_ids, random_states)
             return
         before = [position(random_state) for random_state in random_states]
-        seeds = [seed_of(random_state) for random_state in random_states]
-        for component in self.components:
-            component.begin(env_ids, seeds)
+        for env_id, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            seed = seed_of(random_state)
+            for component in self.components:
+                component.begin(env_id, seed)
         self.reset(env_ids, random_states)
         for random_state, old in zip(random_states, before, strict=True):
             if position(random_state) == old:

@@ -17,7 +17,7 @@ from trl_suite.bodies.blocks import SPIN, VECTOR, Block, Noise, signs
 from trl_suite.bodies.body import Measurement, ahead_and_left, polar
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.bodies.spatial import SpatialState
-from trl_suite.bodies.state import FLAG, PLACE, WHOLE, allocated
+from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE, allocated
 from trl_suite.engine import World
 from trl_suite.tasks.rewards import Outcome, Term, give, terms_data
 from trl_suite.tasks.task import Marker, random_displacement
@@ -70,19 +70,26 @@ def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
 
 
 class Goals(NamedTuple):
-    """The goal of each simulation.
+    """The goal of each simulation, and the way to it.
 
     Attributes:
       place: position, (n, 3) m.
       due: control step of the episode at which it is redrawn, (n,).
       reached: number of goals reached in the episode, (n,).
       wanted: whether it must be redrawn now, (n,).
+      walker: position of the walker's centre of mass at the beginning of the step, (n, 3) m.
+      speed: speed of walker or ball towards the goal, in the last step, (n,) m/s.
+      trace: last positions of the centre of mass, for rendering, a ring buffer, (n, TRACE_PLACES, 3)
+        m; NaN where no position has been stored yet.
     """
 
+    trace: np.ndarray
     place: np.ndarray = PLACE
     due: np.ndarray = WHOLE
     reached: np.ndarray = WHOLE
     wanted: np.ndarray = FLAG
+    walker: np.ndarray = PLACE
+    speed: np.ndarray = REAL
 
 
 GOAL = Block(
@@ -109,26 +116,14 @@ class BallState(NamedTuple):
     Attributes:
       due: control step of the episode at which it is placed again.
       begin: its position at the beginning of the step, (n, 3) m.
-      walker: position of the walker's centre of mass at that time, (n, 3) m.
       at_goal: whether it is at the goal.
       wanted: whether it must be placed again now.
     """
 
     due: np.ndarray = WHOLE
     begin: np.ndarray = PLACE
-    walker: np.ndarray = PLACE
     at_goal: np.ndarray = FLAG
     wanted: np.ndarray = FLAG
-
-
-class Trace(NamedTuple):
-    """The last positions of n bodies.
-
-    Attributes:
-      places: (n, TRACE_PLACES, 3) m, a ring buffer; NaN where no position has been stored yet.
-    """
-
-    places: np.ndarray
 
 
 class GoalData(NamedTuple):
@@ -144,7 +139,6 @@ class GoalData(NamedTuple):
     """
 
     goals: Goals
-    trace: Trace
     near: float
     target_speed: float
     with_ball: bool
@@ -168,20 +162,20 @@ def observe_place(
 
 
 @compiled
-def follow(i: int, count: int, place: np.ndarray, trace: Trace) -> None:
-    """Stores the position of body i, from `place` (n, 3) m, after `count` control steps."""
+def follow(i: int, count: int, measurement: Measurement, goals: Goals) -> None:
+    """Stores the position of a walker after `count` control steps."""
     if count % TRACE_EVERY == 0:
         for k in range(3):
-            trace.places[i, count // TRACE_EVERY % TRACE_PLACES, k] = place[i, k]
+            goals.trace[i, count // TRACE_EVERY % TRACE_PLACES, k] = measurement.com[i, k]
 
 
 @compiled
 def remember(i: int, physics: SpatialState, measurement: Measurement, data: GoalData) -> None:
-    """Stores the positions of ball and walker at the beginning of a step."""
-    if data.with_ball:
-        for k in range(3):
+    """Stores the positions of walker and ball at the beginning of a step."""
+    for k in range(3):
+        data.goals.walker[i, k] = measurement.com[i, k]
+        if data.with_ball:
             data.ball.begin[i, k] = physics.qpos[i, data.qpos + k]
-            data.ball.walker[i, k] = measurement.com[i, k]
 
 
 @compiled
@@ -206,7 +200,7 @@ def dribble(
       The ball's speed towards the goal, m/s.
     """
     ball, goal, terms = data.ball, data.goals.place, data.terms
-    walker, begin = ball.walker, ball.begin
+    walker, begin = data.goals.walker, ball.begin
     x, y = physics.qpos[i, data.qpos], physics.qpos[i, data.qpos + 1]
     z = physics.qpos[i, data.qpos + 2]
     gap_x, gap_y = x - walker[i, 0], y - walker[i, 1]
@@ -398,13 +392,12 @@ class GoalTask(BodyTask):
         """Goal of the walker, or of the ball, (n, 3) m."""
         return self.goals.place
 
-    def _bind_goals(self, world: World, target_speed: float, speed: np.ndarray) -> GoalData:
-        """Allocates goals; `speed` (n,) m/s is that towards them in the last step, for `info`."""
+    def _bind_goals(self, world: World, target_speed: float) -> GoalData:
+        """Allocates goals, and binds the ball."""
         n, ball, terms = world.n, self.ball, soccer_terms()
-        self.goals = allocated(Goals, n)
-        self._trace = Trace(np.full((n, TRACE_PLACES, 3), np.nan))
-        self.saved = (*self.saved, self.goals, self._trace)
-        self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': speed}
+        self.goals = allocated(Goals, n, trace=np.zeros((TRACE_PLACES, 3)))
+        self.saved = (*self.saved, self.goals)
+        self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.goals.speed}
         qpos = dof = body = -1
         state = allocated(BallState, n)
         if ball:
@@ -414,7 +407,6 @@ class GoalTask(BodyTask):
             qpos, dof, body, terms = int(ball.qpos[0]), int(ball.dof[0]), int(ball.body), self.terms
         return GoalData(
             goals=self.goals,
-            trace=self._trace,
             near=self.goal_reached,
             target_speed=target_speed,
             with_ball=ball is not None,
@@ -427,8 +419,8 @@ class GoalTask(BodyTask):
 
     def _begin_goals(self, env_ids: np.ndarray) -> None:
         """Draws the first goals of episodes, and places the balls."""
-        self.goals.reached[env_ids] = 0
-        self._trace.places[env_ids] = np.nan
+        self.goals.reached[env_ids] = self.goals.speed[env_ids] = 0
+        self.goals.trace[env_ids] = np.nan
         for i in env_ids.tolist():
             self.begin_goal(i)
         if self.ball:
@@ -469,7 +461,7 @@ class GoalTask(BodyTask):
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of past positions of the centre of mass, and of the goal."""
-        places, size, goal = self._trace.places[env_id], (TRACE_RADIUS,) * 3, self.goal[env_id]
+        places, size, goal = self.goals.trace[env_id], (TRACE_RADIUS,) * 3, self.goal[env_id]
         past = places[np.isfinite(places[:, 0])]
         there = flag(goal)
         if self.ball:

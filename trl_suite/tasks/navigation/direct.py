@@ -18,7 +18,6 @@ from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import go
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, moment, observe_phase
 from trl_suite.bodies.spatial import SpatialState
-from trl_suite.bodies.state import REAL, allocated
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import Clip, FootstepLibrary
@@ -85,12 +84,6 @@ def direct_terms(share: float, where: str) -> tuple[Term, ...]:
     )  # fmt: skip
 
 
-class Progress(NamedTuple):
-    """Speed of each walker's centre of mass towards its goal, (n,) m/s."""
-
-    speed: np.ndarray = REAL
-
-
 class DirectData(NamedTuple):
     """Data for the compiled functions of direct navigation.
 
@@ -102,7 +95,6 @@ class DirectData(NamedTuple):
     tracking: TrackingData
     physics: SpatialState
     aims: GoalData
-    progress: Progress
 
 
 # A step, after bodies were measured: `advance_all`, the next goals if some are needed, `finish_all`.
@@ -132,7 +124,7 @@ def compare(i: int, data: DirectData) -> None:
     give(i, facing(off), terms.heading, outcome)
     score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
     along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
-    data.progress.speed[i] = along / max(distance, 1e-9)
+    data.aims.goals.speed[i] = along / max(distance, 1e-9)
 
 
 @compiled
@@ -156,7 +148,7 @@ def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     for i in env_ids:
         aims.goals.wanted[i] = aims.ball.wanted[i] = False
         if proceed(i, tracking):
-            follow(i, steps[i], measurement.com, aims.trace)
+            follow(i, steps[i], measurement, aims.goals)
             if aims.with_ball:
                 dribble(i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome)
             wanted += test_goal(i, steps[i], measurement, aims)
@@ -249,18 +241,14 @@ class DirectNavigation(GoalTask, TrackingTask):
         return BALL_GOAL if self.ball else GOAL, BALL.observed_if(self.ball is not None)
 
     def _bind(self, world: World) -> DirectData:
-        tracking, n = super()._bind(world), world.n
-        self.progress = allocated(Progress, n)
-        self.saved = (*self.saved, self.progress)
-        aims = self._bind_goals(world, SPEED, self.progress.speed)
-        return DirectData(tracking, self.figure.data.physics, aims, self.progress)
+        tracking, aims = super()._bind(world), self._bind_goals(world, SPEED)
+        return DirectData(tracking, self.figure.data.physics, aims)
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         self._begin_goals(env_ids)
         if self.ball:
-            ball, measurement = self.ball.state, self.figure.measure(env_ids)
-            ball.begin[env_ids] = self.ball.place[env_ids]
-            ball.walker[env_ids] = measurement.com[env_ids]
+            self.ball.state.begin[env_ids] = self.ball.place[env_ids]
+        self.goals.walker[env_ids] = self.figure.measure(env_ids).com[env_ids]
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.figure.measure(env_ids, stepped=True)

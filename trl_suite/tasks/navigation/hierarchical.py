@@ -219,7 +219,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         n, blocks = world.n, self._controller_blocks
         self.plan, self.state = allocated(FootstepPlan, n), allocated(PlanningState, n)
         self.saved = (*self.saved, self.plan, self.state)
-        aims = self._bind_goals(world, float(self.config.target_speed), self.state.speed)
+        aims = self._bind_goals(world, float(self.config.target_speed))
         self.info_arrays |= {
             'landed': self.plan.landed,
             'landing_error': self.plan.landing_error,
@@ -262,11 +262,9 @@ class HierarchicalNavigation(Planned, GoalTask):
         return poses, rates, self.travel.origin[env_ids]
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        plan, state = self.plan, self.state
-        plan.landing_error[env_ids] = plan.heading_error[env_ids] = state.down[env_ids] = 0.0
-        plan.landed[env_ids] = False
-        state.lasted[env_ids] = 0
-        state.speed[env_ids] = state.duration[env_ids] = 0.0
+        plan = self.plan
+        for array in (*self.state, plan.landing_error, plan.heading_error, plan.landed):
+            array[env_ids] = 0
         self._begin_goals(env_ids)
         measurement = self.figure.measure(env_ids)
         # Before the first action, the plan is the current positions of the feet.

@@ -11,7 +11,7 @@ from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
 from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, go
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
 from trl_suite.bodies.spatial import LINES, breaks_down, measure, observe_body
-from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE
+from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import (
     GoalData,
@@ -61,17 +61,13 @@ class PlanningState(NamedTuple):
     Attributes:
       lasted: number of control steps in the last step.
       duration: duration of the last step, s.
-      begin: position of the centre of mass at its beginning, (n, 3) m.
       down: decaying average of samples with a fall link on the ground.
-      speed: mean speed of walker or ball towards the goal in the last step, m/s.
       over: whether the step is over.
     """
 
     lasted: np.ndarray = WHOLE
     duration: np.ndarray = REAL
-    begin: np.ndarray = PLACE
     down: np.ndarray = REAL
-    speed: np.ndarray = REAL
     over: np.ndarray = FLAG
 
 
@@ -174,7 +170,7 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
-    follow(i, count, measurement.com, data.aims.trace)
+    follow(i, count, measurement, data.aims.goals)
     state.over[i] = (
         plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST or not data.by_plan
     )
@@ -187,26 +183,26 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
 def score(i: int, data: PlanningData) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
     body, aims, state, outcome = data.body, data.aims, data.state, data.outcome
-    measurement, place = body.measurement, data.aims.goals.place
+    measurement, place, begin = body.measurement, aims.goals.place, aims.goals.walker
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
     aims.goals.wanted[i] = aims.ball.wanted[i] = False
     if outcome.diverged[i]:
         return False
     if aims.with_ball:
-        state.speed[i] = dribble(i, seconds, body.physics, measurement, aims, outcome)
+        aims.goals.speed[i] = dribble(i, seconds, body.physics, measurement, aims, outcome)
     else:
-        x, y = place[i, 0] - state.begin[i, 0], place[i, 1] - state.begin[i, 1]
+        x, y = place[i, 0] - begin[i, 0], place[i, 1] - begin[i, 1]
         distance = math.hypot(x, y)
-        moved_x = measurement.com[i, 0] - state.begin[i, 0]
-        moved_y = measurement.com[i, 1] - state.begin[i, 1]
+        moved_x = measurement.com[i, 0] - begin[i, 0]
+        moved_y = measurement.com[i, 1] - begin[i, 1]
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
         lack = min(speed - aims.target_speed, 0.0)
         full = distance < aims.near
         worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
         give(i, worth, data.terms.speed, outcome)
         give(i, 1.0, data.terms.upright, outcome)
-        state.speed[i] = speed
+        aims.goals.speed[i] = speed
     return not outcome.failed[i] and test_goal(i, data.clock.steps[i], measurement, aims)
 
 
@@ -238,8 +234,6 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
         look(i, data)
         lay_plan(i, action, data)
         state.lasted[i] = 0
-        for k in range(3):
-            state.begin[i, k] = body.measurement.com[i, k]
         remember(i, body.physics, body.measurement, data.aims)
         data.plan.landed[i] = False
         observe_for_controller(i, data)

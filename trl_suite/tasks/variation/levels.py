@@ -62,12 +62,11 @@ class Levels(Component):
         self.info_arrays = {'level': self.state.level}
         return outcome
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
         level, chosen = self.state
-        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-            drawn = np.random.default_rng(spawned(seed, LEVELS)).integers(self.count)
-            level[env_id] = self.first + drawn if chosen[env_id] < 0 else chosen[env_id]
-        chosen[env_ids] = -1
+        drawn = np.random.default_rng(spawned(seed, LEVELS)).integers(self.count)
+        level[env_id] = self.first + drawn if chosen[env_id] < 0 else chosen[env_id]
+        chosen[env_id] = -1
 
     def choose(self, env_ids: Any, level: int | Sequence[int]) -> None:
         """Sets the level of the next episode of some simulations: one for all, or one for each.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,16 +84,15 @@ class Motors(Component):
         """Returns a delay in ms as physics steps."""
         return round(delay / 1000 / self._timestep)
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-            own = spawned(seed, MOTORS)
-            state, rng = self.motors, np.random.default_rng(own)
-            state.age[env_id] = state.given[env_id] = state.used[env_id] = 0
-            state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
-            state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
-            state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
-            self._streams.seed(env_id, own.spawn(1)[0])
-            self.restored(env_id)
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        own = spawned(seed, MOTORS)
+        state, rng = self.motors, np.random.default_rng(own)
+        state.age[env_id] = state.given[env_id] = state.used[env_id] = 0
+        state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
+        state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
+        state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
+        self._streams.seed(env_id, own.spawn(1)[0])
+        self.restored(env_id)
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self._age[env_ids] = self.motors.age[env_ids]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -90,12 +89,12 @@ class Pushes(Component):
             self.info_arrays = {'impulse': pushes.state.impulse}
         return outcome
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        state = self._pushes.state
         if not self._series:
-            for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-                seeded(env_id, spawned(seed, PUSH), self._pushes.state.stream)
-        self._pushes.state.impulse[env_ids] = 0.0
-        first_push(env_ids, self._series, self.task.world.pack)
+            seeded(env_id, spawned(seed, PUSH), state.stream)
+        state.impulse[env_id] = 0.0
+        first_push(env_id, self._series, self.task.world.pack)
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self._pushes.state.impulse[env_ids] = 0.0
@@ -122,7 +121,6 @@ class Pushes(Component):
 
 
 @compiled
-def first_push(env_ids: np.ndarray, series: int, engine: Any) -> None:
-    """Draws the first push of episodes, which begin at time 0; takes the pack of a world."""
-    for i in env_ids:
-        draw(i, series, 0.0, engine.pushes)
+def first_push(i: int, series: int, engine: Any) -> None:
+    """Draws the first push of an episode, which begins at time 0; takes the pack of a world."""
+    draw(i, series, 0.0, engine.pushes)

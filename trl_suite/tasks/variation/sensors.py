@@ -304,9 +304,8 @@ class Sensors(Component):
         self.info_arrays = {'clean_observation': outcome.observation}
         return Outcome(data.state.observation, *outcome[1:])
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-            seeded(env_id, spawned(seed, SENSORS), self._state.stream)
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        seeded(env_id, spawned(seed, SENSORS), self._state.stream)
 
     def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
         sense_all(env_ids, fresh, self._pack)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -196,11 +196,10 @@ class Worlds(Component):
         }
         return outcome
 
-    def begin(self, env_ids: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
-            random = np.random.default_rng(spawned(seed, WORLD))
-            draw(env_id, self._config, random, self._spatial, self.variation.properties)
-            self.variation.apply(env_id)
+    def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        random = np.random.default_rng(spawned(seed, WORLD))
+        draw(env_id, self._config, random, self._spatial, self.variation.properties)
+        self.variation.apply(env_id)
 
     def restored(self, env_id: int) -> None:
         self.variation.apply(env_id)
