@@ -44,6 +44,11 @@ class Marker(NamedTuple):
     yaw: float = 0.0
 
 
+def _of_outcome(name: str, meaning: str) -> Any:
+    """Returns a property of a task: an array of its outcome."""
+    return property(lambda task: getattr(task.outcome, name), doc=meaning)
+
+
 class Task(composer.Task):
     """Observation, reward, termination and reset of an environment, for n simulations at once.
 
@@ -285,30 +290,11 @@ class Task(composer.Task):
             component.restored(env_id)
         self.set_state(env_id, state['task'])
 
-    @property
-    def observation(self) -> np.ndarray:
-        """Exact observation, without what components add or change, (n, size)."""
-        return self.outcome.observation
-
-    @property
-    def reward(self) -> np.ndarray:
-        """Reward of the last step, (n,)."""
-        return self.outcome.reward
-
-    @property
-    def reward_terms(self) -> np.ndarray:
-        """Weighted terms of the reward, (n, terms)."""
-        return self.outcome.reward_terms
-
-    @property
-    def failed(self) -> np.ndarray:
-        """Whether the episode has ended with discount 0, (n,) bool."""
-        return self.outcome.failed
-
-    @property
-    def diverged(self) -> np.ndarray:
-        """Whether the episode has ended because the physics diverged, (n,) bool."""
-        return self.outcome.diverged
+    observation = _of_outcome('observation', 'Exact observation, without components, (n, size).')
+    reward = _of_outcome('reward', 'Reward of the last step, (n,).')
+    reward_terms = _of_outcome('reward_terms', 'Weighted terms of the reward, (n, terms).')
+    failed = _of_outcome('failed', 'Whether the episode has ended with discount 0, (n,) bool.')
+    diverged = _of_outcome('diverged', 'Whether it has because the physics diverged, (n,) bool.')
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
-from trl_suite.bodies.body import Measurement
 from trl_suite.motion import quaternion
 from trl_suite.tasks.common.footstep_plan import SIDE, Planned
 from trl_suite.tasks.footsteps.rules import FootstepState
@@ -92,86 +92,59 @@ class PlanTask(Planned, TrackingTask):
     _grace_steps = 0  # control steps after a sharp turn in which landing errors do not count
     _drawn_plans: Plans  # how plans are drawn; for planar characters without what they have not
 
-    def _begin_plans(self, env_ids: np.ndarray, measurement: Measurement) -> None:
-        """Draws the first plans of episodes, and their first goals.
-
-        Args:
-          env_ids: indices of simulations, (m,), whose stance feet are known.
-          measurement: measurement of the characters.
-        """
-        plan, state, origins = self.plan, self.state, self.travel.origin[env_ids]
-        aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
-        for k, i in enumerate(env_ids.tolist()):
-            self._redraw_size(i, always=True)
-            aside[k] = state.width[i]
-            if self.goal_given:
-                state.goal[i] = self.arena.goal(i, self._random[i], origins[k, :2], 'near')
-            sizes[k] = self._next_size(i), self._next_size(i)
-        places, angles = origins[:, :2], origins[:, 2]
-        plan.heading[env_ids] = angles
-        stance = plan.stance[env_ids]
-        anchors = measurement.feet[env_ids, stance, :2]
+    def _begin_plan(self, i: int) -> None:
+        """Draws the first plan of an episode, and its first goal; the stance foot is known."""
+        plan, state, random = self.plan, self.state, self._random[i]
+        place, angle = self.travel.origin[i, :2], self.travel.origin[i, 2]
+        feet, stance = self.figure.measurement.feet[i, :, :2], plan.stance[i]
+        self._redraw_size(i, always=True)
+        aside = state.width[i]
         if self.goal_given:
-            self._head_for_goals(env_ids, measurement.root[env_ids, :2])
-        else:
-            # The feet land on both sides of a line through the start, at half a width from it.
-            line = quaternion.rotate_xy(anchors - places, -angles)
-            line[:, 1] = 0.5 * SIDE[stance] * aside
-            anchors = places + quaternion.rotate_xy(line, angles)
-        for which, foot in enumerate((1 - stance, stance)):
-            anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
+            state.goal[i] = self.arena.goal(i, random, place, 'near')
+        sizes = self._next_size(i), self._next_size(i)
+        plan.heading[i] = angle
+        if self.goal_given:
+            self._head_for_goal(i, self.figure.measurement.root[i, :2])
+            self._lay_both(i, feet[stance], sizes)
+            return
+        # The feet land on both sides of a line through the start, at half a width from it.
+        line = quaternion.rotate_xy(feet[stance] - place, -angle)
+        line[1] = 0.5 * SIDE[stance] * aside
+        self._lay_both(i, place + quaternion.rotate_xy(line, angle), sizes)
 
-    def _replan(self, env_ids: np.ndarray, measurement: Measurement) -> None:
-        """Draws the next plans of some simulations at a switch of stance.
-
-        Args:
-          env_ids: indices of simulations, (m,).
-          measurement: measurement of the characters.
-        """
-        plans, plan, count = self._drawn_plans, self.plan, len(env_ids)
-        by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
-        for k, i in enumerate(env_ids.tolist()):
-            random = self._random[i]
-            if plans.from_root and random.uniform() < plans.from_root:
-                by_root[k] = True
-                turns[k] = random.normal(0, plans.root_turn)
-                for which in (0, 1):
-                    ahead = random.uniform(*plans.root_length)
-                    sizes[k, which] = ahead, random.uniform(*plans.root_width)
-                continue
-            if self.goal_given:
-                root, goal = measurement.root[i, :2], self.state.goal
-                if np.hypot(*(root - goal[i, :2])) < GOAL_REACHED:
-                    goal[i] = self.arena.goal(i, random, root, 'near')
-            elif plans.sharp and random.uniform() < plans.sharp:
-                turns[k] = random.uniform(-np.pi, np.pi)
-                self.state.excused[i] = self.clock.steps[i] + self._grace_steps
-            elif plans.turn:
-                turns[k] = random.normal(0, plans.turn)
-            sizes[k, 1] = self._next_size(i)
-        stance = plan.stance[env_ids]
-        on = ~by_root
-        if on.any():
-            going = env_ids[on]
-            if self.goal_given:
-                self._head_for_goals(going, plan.landing[going, :, :2].mean(1))
-            plan.heading[going] += turns[on]
-            plan.landing[going, 0] = plan.landing[going, 1]
-            self._lay(going, 1, stance[on], plan.landing[going, 0, :2], sizes[on, 1])
-        if by_root.any():
-            going, foot = env_ids[by_root], stance[by_root]
-            off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
-            plan.heading[going] = measurement.heading[going] + off
-            places = measurement.feet[going, foot, :2]
-            for which, feet in enumerate((1 - foot, foot)):
-                places = self._lay(going, which, feet, places, sizes[by_root, which])
+    def _replan(self, i: int) -> None:
+        """Draws the next plan of a simulation at a switch of stance."""
+        plans, plan, random = self._drawn_plans, self.plan, self._random[i]
+        measurement, stance, turn = self.figure.measurement, plan.stance[i], 0.0
+        if plans.from_root and random.uniform() < plans.from_root:
+            turn = np.clip(random.normal(0, plans.root_turn), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            ranges = plans.root_length, plans.root_width
+            first, second = ([random.uniform(*each) for each in ranges] for _ in range(2))
+            plan.heading[i] = measurement.heading[i] + turn
+            self._lay_both(i, measurement.feet[i, stance, :2], (first, second))
+            return
+        if self.goal_given:
+            root, goal = measurement.root[i, :2], self.state.goal
+            if np.hypot(*(root - goal[i, :2])) < GOAL_REACHED:
+                goal[i] = self.arena.goal(i, random, root, 'near')
+        elif plans.sharp and random.uniform() < plans.sharp:
+            turn = random.uniform(-np.pi, np.pi)
+            self.state.excused[i] = self.clock.steps[i] + self._grace_steps
+        elif plans.turn:
+            turn = random.normal(0, plans.turn)
+        size = self._next_size(i)
+        if self.goal_given:
+            self._head_for_goal(i, plan.landing[i, :, :2].mean(0))
+        plan.heading[i] += turn
+        plan.landing[i, 0] = plan.landing[i, 1]
+        self._lay(i, 1, stance, plan.landing[i, 0, :2], size)
 
     def _redraw_size(self, i: int, always: bool = False) -> None:
         """Redraws length and width of steps, always or with probability `change`."""
         plans, random = self._drawn_plans, self._random[i]
         if always or random.uniform() < plans.change:
             self.state.length[i] = random.uniform(*plans.length)
-            if self._spatial:
+            if self._spatial:  # only then steps have a width
                 self.state.width[i] = random.uniform(*plans.width)
 
     def _next_size(self, i: int) -> tuple[float, float]:
@@ -179,36 +152,35 @@ class PlanTask(Planned, TrackingTask):
         self._redraw_size(i)
         return float(self.state.length[i]), float(self.state.width[i])
 
-    def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
-        """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
-        displacement = self.state.goal[env_ids, :2] - places
-        headings = np.arctan2(displacement[:, 1], displacement[:, 0])
-        far = np.hypot(displacement[:, 0], displacement[:, 1]) > NEAR_GOAL
-        self.plan.heading[env_ids[far]] = headings[far]
+    def _head_for_goal(self, i: int, place: np.ndarray) -> None:
+        """Sets the planned heading from a place (2,) to the goal, except within NEAR_GOAL."""
+        x, y = self.state.goal[i, :2] - place
+        if np.hypot(x, y) > NEAR_GOAL:
+            self.plan.heading[i] = np.arctan2(y, x)
+
+    def _lay_both(self, i: int, place: np.ndarray, sizes: Sequence[Sequence[float]]) -> None:
+        """Writes both landing places to a plan, from the position (2,) of the stance foot."""
+        stance = self.plan.stance[i]
+        for which, foot in enumerate((1 - stance, stance)):
+            place = self._lay(i, which, foot, place, sizes[which])
 
     def _lay(
-        self,
-        env_ids: np.ndarray,
-        which: int,
-        feet: np.ndarray,
-        places: np.ndarray,
-        sizes: np.ndarray,
+        self, i: int, which: int, foot: int, place: np.ndarray, size: Sequence[float]
     ) -> np.ndarray:
-        """Writes one landing place to each plan: a step from the position of the other foot.
+        """Writes one landing place to a plan: a step from the position of the other foot.
 
         Args:
-          env_ids: indices of simulations, (m,).
+          i: index of the simulation.
           which: which of the plan's two landing places, 0 or 1.
-          feet: the feet that step, (m,).
-          places: positions of the other feet, (m, 2) m.
-          sizes: lengths and widths of the steps, (m, 2) m.
+          foot: the foot that steps.
+          place: position of the other foot, (2,) m.
+          size: length and width of the step, m.
 
         Returns:
-          The landing places, (m, 2) m.
+          The landing place, (2,) m.
         """
-        steps = sizes.copy()
-        steps[:, 1] *= SIDE[feet]
-        places = places + quaternion.rotate_xy(steps, self.plan.heading[env_ids])
-        self.plan.landing[env_ids, which, :2] = places
-        self.plan.landing[env_ids, which, 2] = self.figure.heights(env_ids, places)
-        return places
+        step = np.array([size[0], size[1] * SIDE[foot]])
+        place = place + quaternion.rotate_xy(step, self.plan.heading[i])
+        self.plan.landing[i, which, :2] = place
+        self.plan.landing[i, which, 2] = self.figure.heights(np.array([i]), place[None])[0]
+        return place

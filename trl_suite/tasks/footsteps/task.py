@@ -150,12 +150,14 @@ class Footsteps(PlanTask):
     # Episodes.
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        measurement, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        plan, state = self.plan, self.state
+        self.figure.measure(env_ids)
         plan.stance[env_ids] = self.phase[env_ids] >= 0.5
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
         state.excused[env_ids] = 0
-        self._begin_plans(env_ids, measurement)
+        for i in env_ids.tolist():
+            self._begin_plan(i)
         align_all(env_ids, self._first_tracks(env_ids), self._pack)
 
     @abc.abstractmethod
@@ -172,7 +174,8 @@ class Footsteps(PlanTask):
         measurement = self.figure.measure(env_ids, stepped=True)
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
-            self._replan(switched, measurement)
+            for i in switched.tolist():
+                self._replan(i)
             align_all(switched, self._choose(switched, measurement), self._pack)
             self.finish_all(switched, self._pack)
 
