@@ -1,5 +1,7 @@
 """Tests of the gait state machines: parameters, dynamics, laws and transitions, recomputed."""
 
+import functools
+
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -130,29 +132,35 @@ class ParametersTest(parameterized.TestCase):
         )  # fmt: skip
 
 
+@functools.lru_cache(1)
+def pack(gait):
+    """Returns the data of a gait for compiled functions."""
+    return packed(gait.rules)
+
+
 def begin(gait):
     """Starts the first cycles of all machines."""
     for i in range(gait.world.n):
-        gaits.begin(i, gait.parameters.action_offset, packed(gait.rules))
+        gaits.begin(i, gait.parameters.action_offset, pack(gait))
 
 
 def apply(gait, vectors):
     """Begins cycles of all machines with parameters (n, P)."""
     gait.state.vector[:] = vectors
     for i in range(gait.world.n):
-        gaits.apply(i, packed(gait.rules))
+        gaits.apply(i, pack(gait))
 
 
 def torques(gait):
     """Returns the torques of the next control step, (n, J)."""
     for i in range(gait.world.n):
-        gaits.act(i, packed(gait.rules))
+        gaits.act(i, pack(gait))
     return gait.rules.scratch.torque.copy()
 
 
 def advance(gait):
     """Advances all machines; returns whether their cycles have ended."""
-    return [gaits.advance(i, packed(gait.rules)) for i in range(gait.world.n)]
+    return [gaits.advance(i, pack(gait)) for i in range(gait.world.n)]
 
 
 class Rig:
@@ -453,10 +461,8 @@ class LawTest(parameterized.TestCase):
         rng = rig.scatter(9, speed=30.0)
         gait, limits = rig.gait, rig.character.torque_limits
         spread = np.maximum(5 * np.abs(gait.parameters.action_scale), 3.0)
-        apply(
-            gait,
-            gait.parameters.action_offset + rng.normal(size=gait.state.vector.shape) * spread,
-        )
+        noise = rng.normal(size=gait.state.vector.shape)
+        apply(gait, gait.parameters.action_offset + noise * spread)
         gait.state.number[:] = rig.env_ids % 4
         enter(rig)
         touching = rng.random((40, len(rig.character.spec.links))) < 0.5
