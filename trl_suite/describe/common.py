@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite import characters, terrain
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.util.tables import Section, Table, section
@@ -125,4 +126,18 @@ def reward(task: Any, *notes: str, title: str = 'Reward of a step') -> Section:
             ],
         ),
         *notes,
+    )
+
+
+def actions(
+    action_map: ActionMap, titles: Sequence[str], *columns: Iterable[object], unit: str = ''
+) -> Section:
+    """Returns the table of what each action does; `titles` of its name, and of further columns."""
+    offset = floats(np.round(action_map.action_offset, 9) + 0.0)
+    cells = zip(action_map.names, offset, floats(action_map.action_scale), *columns, strict=True)
+    first, *others = titles
+    return section(
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '
+        'action_scale * action',
+        Table((first, 'action_offset', 'action_scale', *others), list(cells), numbered=True),
     )

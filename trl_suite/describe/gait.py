@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.describe.common import floats, reward
+from trl_suite.describe.common import actions, reward
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.gait import rules as gait_rules
@@ -83,17 +83,7 @@ def action(environment: Environment) -> Section:
         )
     units = [_unit(task, name) for name in action_map.names]
     effects = [_effect(task, name) for name in action_map.names]
-    columns = (
-        action_map.names, floats(action_map.action_offset), floats(action_map.action_scale), units, effects,
-    )  # fmt: skip
-    return section(
-        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
-        Table(
-            ('sets', 'action_offset', 'action_scale', 'unit', 'meaning'),
-            list(zip(*columns, strict=True)),
-            numbered=True,
-        ),
-    )
+    return actions(action_map, ('sets', 'unit', 'meaning'), units, effects)
 
 
 def _unit(task: Any, parameter: str) -> str:

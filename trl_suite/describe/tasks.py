@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import terrain
 from trl_suite.describe import gait
-from trl_suite.describe.common import REWARD_WEIGHT, floats, reward
+from trl_suite.describe.common import REWARD_WEIGHT, actions, floats, reward
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
@@ -20,7 +20,7 @@ from trl_suite.tasks.rewards import fall_condition
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
-from trl_suite.util.tables import Section, Table, section
+from trl_suite.util.tables import Section, section
 
 _PLANS = 'Plans: drawn at every switch of stance'
 _SWING = (
@@ -48,16 +48,7 @@ def action(environment: Environment) -> Section:
     action_map = environment.action_map
     title, limits = _limits(environment)
     unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
-    columns = (np.round(action_map.action_offset, 9) + 0.0, action_map.action_scale, limits)
-    return section(
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '
-        'action_scale * action',
-        Table(
-            ('controls', 'action_offset', 'action_scale', title),
-            list(zip(action_map.names, *map(floats, columns), strict=True)),
-            numbered=True,
-        ),
-    )
+    return actions(action_map, ('controls', title), floats(limits), unit=unit)
 
 
 def _limits(environment: Environment) -> tuple[str, Any]:
@@ -181,25 +172,9 @@ def _plans(task: Any) -> list[str]:
 
 def _plan_action(environment: Environment) -> Section:
     """Returns the table of what each action plans."""
-    action_map = environment.action_map
-    cells = [
-        (
-            name,
-            action_offset,
-            action_scale,
-            _MEANINGS.get(name, 'action of the footstep controller'),
-        )
-        for name, action_offset, action_scale in zip(
-            action_map.names,
-            floats(action_map.action_offset),
-            floats(action_map.action_scale),
-            strict=True,
-        )
-    ]
-    return section(
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
-        Table(('sets', 'action_offset', 'action_scale', 'unit and meaning'), cells, numbered=True),
-    )
+    names = environment.action_map.names
+    meanings = [_MEANINGS.get(name, 'action of the footstep controller') for name in names]
+    return actions(environment.action_map, ('sets', 'unit and meaning'), meanings)
 
 
 def _planning(spec: EnvSpec, task: Any) -> Iterator[Section]:
