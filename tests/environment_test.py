@@ -22,7 +22,6 @@ from helpers import (
     assert_refused,
     assert_rows_are_singles,
     links_on_ground,
-    made,
 )
 
 from trl_suite import characters, describe, motion, policies, rendering, suite, terrain
@@ -51,10 +50,6 @@ def is_high(id_):
 # so that they hold on other processors.
 ROOT = pathlib.Path(__file__).parents[1]
 STORED = json.loads((ROOT / 'tests/golden.json').read_text())
-
-# Whose falls are looked at: every third whose steps last 1/30 s, and those whose steps are footsteps.
-SHORT = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
-FALLING = {*SHORT[::3], *filter(is_high, suite.ALL_IDS)}
 
 # What papers and documentation say of each environment, reviewed; see `row`.
 TABLE = {
@@ -99,12 +94,17 @@ def rollout(environment, actions):
     ])  # fmt: skip
 
 
-def newly_seeded(id_, seed, step_limit=256, environment=None):
-    """An environment before its first reset, shared by the tests of an id."""
-    environment = environment or made(id_)
-    environment.random_state.seed(seed)
-    environment.step_limit = step_limit
-    return environment
+_last = {}  # id -> the environment that was built last
+
+
+def newly_seeded(id_, seed, step_limit=256):
+    """An environment before its first reset; one serves the tests of an id, which follow one another."""
+    if id_ not in _last:
+        _last.clear()
+        _last[id_] = suite.make(id_)
+    _last[id_].random_state.seed(seed)
+    _last[id_].step_limit = step_limit
+    return _last[id_]
 
 
 def every_environment(id_):
@@ -171,29 +171,6 @@ def every_environment(id_):
                 np.testing.assert_allclose(terms, step.reward, rtol=0, atol=1e-12)
                 np.testing.assert_array_equal(step.reward[step.terminated], 0)
 
-        if id_ in FALLING:
-
-            def test_a_fall_is_a_failure(self):
-                environment = newly_seeded(id_, 5)
-                environment.reset()
-                fall_links = set(environment.task.character.spec.fall_links)
-                for action in random_actions(environment, 250, seed=1):
-                    step = environment.step(action)
-                    if not high:  # otherwise contacts are sampled
-                        touches = bool(links_on_ground(environment) & fall_links)
-                        self.assertEqual(step.last(), touches)
-                    if step.last():
-                        break
-                self.assertTrue(step.last())
-                self.assertEqual((step.discount, step.reward), (0.0, 0.0))
-                self.assertTrue(environment.info['fell'])
-                self.assertFalse(environment.info['diverged'])
-                self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
-                self.assertNotEmpty(links_on_ground(environment) & fall_links)
-                step = environment.step(action)
-                self.assertTrue(step.first())
-                self.assertFalse(environment.info['fell'])
-
         def test_first_steps_equal_the_stored_ones(self):
             stored = dict(STORED[id_])
             # Planners of the record have another controller.
@@ -241,9 +218,9 @@ def every_kind(id_):
 
     class Kind(test_utils.EnvironmentTestMixin, absltest.TestCase):
         def make_object_under_test(self):
-            fresh = self._testMethodName == 'test_step_on_fresh_environment'
-            environment = suite.make(id_) if fresh else None
-            return newly_seeded(id_, 0, 2 if gait or high else 12, environment)  # episodes end
+            if self._testMethodName == 'test_step_on_fresh_environment':
+                _last.clear()
+            return newly_seeded(id_, 0, 2 if gait or high else 12)  # so that episodes end
 
         def tearDown(self):
             absltest.TestCase.tearDown(self)  # the mixin's closes the environment
@@ -262,7 +239,7 @@ def every_kind(id_):
             def go(environment, seed):
                 return advance(environment, steps, seed, 0.3)
 
-            environment = newly_seeded(id_, 6, 256, self.environment)
+            environment = newly_seeded(id_, 6)
             other = suite.make(id_, {'random': 9})
             for each in (environment, other):
                 each.reset()
@@ -277,11 +254,32 @@ def every_kind(id_):
             np.testing.assert_array_equal(found[0], found[1])
             np.testing.assert_array_equal(found[0], found[2])
 
+        if not gait:
+
+            def test_a_fall_is_a_failure(self):
+                environment = newly_seeded(id_, 5)
+                environment.reset()
+                fall_links = set(environment.task.character.spec.fall_links)
+                for action in random_actions(environment, 250, seed=1):
+                    step = environment.step(action)
+                    if not high:  # otherwise contacts are sampled
+                        touches = bool(links_on_ground(environment) & fall_links)
+                        self.assertEqual(step.last(), touches)
+                    if step.last():
+                        break
+                self.assertEqual((step.last(), step.discount, step.reward), (True, 0.0, 0.0))
+                self.assertTrue(environment.info['fell'])
+                self.assertFalse(environment.info['diverged'])
+                self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
+                self.assertNotEmpty(links_on_ground(environment) & fall_links)
+                self.assertTrue(environment.step(action).first())
+                self.assertFalse(environment.info['fell'])
+
         # Gaits and planners step their physics in the task: see gait_test, and below.
         if not gait and not high:
 
             def test_plain_composer_environment_agrees(self):
-                ours = newly_seeded(id_, 3, 256, self.environment)
+                ours = newly_seeded(id_, 3)
                 theirs = composer.Environment(
                     suite.build_task(suite.find(id_)), random_state=3,
                     strip_singleton_obs_buffer_dim=True,
