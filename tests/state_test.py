@@ -233,21 +233,27 @@ class SaveTest(parameterized.TestCase):
         self.check(environment, used)
 
     def test_at_a_reset_and_at_an_end(self):
-        """Also the last observation, info and the number of steps are restored."""
-        environment = suite.make(DOG, {'random': np.random.RandomState(6), 'step_limit': 20})
-        other = suite.make(DOG, {'random': 7, 'step_limit': 20})
+        """The last observation, info and the number of steps are restored as well."""
+        environment = suite.make(DOG, {'random': np.random.RandomState(6), 'step_limit': 7})
+        other = suite.make(DOG, {'random': 7, 'step_limit': 7})
         self.check(environment, other)  # before the first reset
         environment.reset()
         self.check(environment, other)
         environment.reset()
-        for _ in range(300):
+        for _ in range(5):
             step = environment.step(np.zeros(20))
-            other.set_state(environment.get_state())
-            np.testing.assert_equal(other.observation(), step.observation)
-            self.assertEqual(other.info, environment.info)
-            if step.last():
-                break
-        self.assertTrue(other.step(np.zeros(20)).first())
+        other.set_state(environment.get_state())
+        np.testing.assert_equal(other.observation(), step.observation)
+        self.assertEqual(other.info, environment.info)
+        lengths = [0, 0]
+        for i, each in enumerate((environment, other)):
+            while not each.step(np.zeros(20)).last():
+                lengths[i] += 1
+        self.assertEqual(lengths, [1, 1])
+        fresh = suite.make(DOG, {'random': 8})
+        fresh.set_state(environment.get_state())
+        self.assertEqual(fresh.info, environment.info)
+        self.assertTrue(fresh.step(np.zeros(20)).first())
 
     @parameterized.parameters(
         'PD_Raptor2D_Slopes_Mixed_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0', GAITS[0]
