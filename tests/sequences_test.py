@@ -464,24 +464,22 @@ class ResultTest(RunCase):
         ('metrics.forgetting', -0.2, 'metrics.forgetting is -0.2; expected -0.0(4|39)'),
         ('metrcs', 1, "unknown field 'metrcs'; did you mean 'metrics'"),
         *((name, 4, f'{name} is 4; expected a string') for name in (*results.MADE_WITH, 'policy')),
+        ('format', 'trl_suite benchmark 0',
+         "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'", BENCHMARK),
+        ('environment', 'PD_Dog2D_Flat_Terrain-v0',
+         "unknown environment of the core set 'PD_Dog2D_Flat", BENCHMARK),
+        ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps", BENCHMARK),
+        ('samples[19]', [106], r'samples\[19\] is \[106\], in total 106; .* at most 105', BENCHMARK),
+        ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20', BENCHMARK),
+        ('metrics', {'score': 0.9, 'mean_score': 0.42}, r'metrics.score is 0.9; expected', BENCHMARK),
     )  # fmt: skip
-    def test_errors_name_the_field_and_what_was_expected(self, name, value, message):
-        with self.assertRaisesRegex(ValueError, message):
-            sequences.check(changed(self.result, name, value))
-
-    @parameterized.parameters(
-        ('format', 'trl_suite benchmark 0', "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'"),
-        ('environment', 'PD_Dog2D_Flat_Terrain-v0', "unknown environment of the core set 'PD_Dog2D_Flat"),
-        ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps"),
-        ('samples[19]', [106], r'samples\[19\] is \[106\], in total 106; .* at most 105'),
-        ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20'),
-        ('metrics', {'score': 0.9, 'mean_score': 0.42}, r'metrics.score is 0.9; expected'),
-    )  # fmt: skip
-    def test_errors_in_results_of_the_benchmark(self, name, value, message):
+    def test_errors_name_the_field_and_what_was_expected(
+        self, name, value, message, which=SEQUENCES
+    ):
         self.path.unlink()
-        result = self.run_short(Counter(), BENCHMARK)
+        result = self.run_short(Counter(), which)
         with self.assertRaisesRegex(ValueError, message):
-            benchmark.check(changed(result, name, value))
+            which[0].check(changed(result, name, value))
 
     @parameterized.parameters(
         'learner', 'trl_suite', 'seed', 'episodes', 'scores[0][2]', 'samples[0][1]', 'seconds[1]'
