@@ -1,9 +1,7 @@
 """Programs that use the suite through other libraries: the examples run with expected results."""
 
-import contextlib
 import importlib
 import importlib.util
-import io
 import math
 import pathlib
 import re
@@ -16,8 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
-from helpers import FolderTest
-from programs import output
+from programs import CommandTest, output
 
 import trl_suite.gym
 from trl_suite import sequences, suite
@@ -50,8 +47,7 @@ def run_page(word):
         found for found in re.findall('```python\n(.*?)```', page, re.DOTALL) if word in found
     )
     names = {}
-    with contextlib.redirect_stdout(io.StringIO()):
-        exec(compile(code, 'clients.md', 'exec'), names)
+    output(lambda: exec(compile(code, 'clients.md', 'exec'), names))
     return names
 
 
@@ -76,7 +72,7 @@ class GymnasiumTest(absltest.TestCase):
 
 
 @needs('stable_baselines3', 'sb3')
-class StableBaselinesTest(FolderTest):
+class StableBaselinesTest(CommandTest):
     @pytest.mark.slow
     def test_example_runs(self):
         out = run_example('stable_baselines_ppo', '--samples', '40960', '--every', '4096')
@@ -87,7 +83,6 @@ class StableBaselinesTest(FolderTest):
     def test_learners_of_sequences(self):
         """The second stage of PLAiD takes samples on both terrains."""
         sequence = sequences.Sequence('two', ('PD_Biped2D_Flat_Terrain-v0', GAPS))
-        self.enterContext(contextlib.chdir(self.folder))
         for name, kind, expected in (
             ('continual_learning', 'FineTuning', [[4096, 0], [0, 4096]]),
             ('plaid', 'Plaid', [[4096, 0], [320, 2048 + 320]]),

@@ -3,7 +3,6 @@
 `benchmark_test` has what only the benchmark does.
 """
 
-import contextlib
 import copy
 import json
 import os
@@ -613,12 +612,11 @@ class LearnerTest(CommandTest):
         self.assert_refused(message, *command, '--learner', *arguments)
 
 
-class BaselinesTest(FolderTest):
+class BaselinesTest(CommandTest):
     """With small networks, in which every stage makes some updates."""
 
     def setUp(self):
         super().setUp()
-        self.enterContext(contextlib.chdir(self.folder))
         made, small = continual.settings.settings_for, {'hidden': (16, 16), 'minibatch': 128}
         small['cloning_epochs'] = 2
 
