@@ -75,8 +75,8 @@ class SpatialFootstepsConfig(MirroredConfig):
     goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
     pushes: PushConfig | None = option(
         None,
-        'pushes of the torso, or of another body: a mapping of options of push, as in randomize, but by '
-        f'default {PUSHES}; None: there are none',
+        'pushes of the torso, or of another body, if given: a mapping of options of push, as in '
+        f'randomize, with the defaults {PUSHES}',
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     grace_period: float = option(
