@@ -141,6 +141,8 @@ class WorldTest(parameterized.TestCase):
         self.assertEqual(offset[1] == 0, not spatial)
         joints = figure.pose_dof[6 if spatial else 3 :]
         np.testing.assert_allclose(after.dof_damping[joints], 3 * before.dof_damping[joints])
+        own = before.geom_priority > 0  # a ball keeps the friction of its contacts
+        np.testing.assert_array_equal(after.geom_friction[own], before.geom_friction[own])
         if id_ in (PLANAR, STEPS):
             self.assertGreater(before.dof_damping[joints].min(), 0)
             found = []
