@@ -65,16 +65,15 @@ class TaskType:
     samples: str = 'control steps'
 
 
-def tracking(task: Callable[..., Task], **more: Any) -> Callable[[Parts, Any], Task]:
-    """Returns the `make` function of a task class with a reference motion; `more`: arguments."""
-    return lambda parts, config: task(
-        parts.character,
-        parts.arena,
-        parts.motion,
-        config,
-        actuation_model=parts.actuation,
-        **{name: made(parts.arena) for name, made in more.items()},
-    )
+def tracking(task: Callable[..., Task], with_ball: bool = False) -> Callable[[Parts, Any], Task]:
+    """Returns the `make` function of a task class with a reference motion, or also with a ball."""
+
+    def make(parts: Parts, config: Any) -> Task:
+        ball = {'ball': Ball(parts.arena)} if with_ball else {}
+        part = parts.character, parts.arena, parts.motion, config
+        return task(*part, actuation_model=parts.actuation, **ball)
+
+    return make
 
 
 def _direct(parts: Parts, config: Any) -> Task:
@@ -94,14 +93,14 @@ def _tracking(name: str, spatial: bool, task: Any, kind: Any) -> TaskType:
     return TaskType(full, name, spatial, task.CONFIG, tracking(task), kind)
 
 
-def _planned(name: str, **more: Any) -> TaskType:
+def _planned(name: str, with_ball: bool = False) -> TaskType:
     """Returns the type of a task whose actions are plans."""
     return TaskType(
         name,
         name,
         True,
         HierarchicalConfig,
-        tracking(HierarchicalNavigation, **more),
+        tracking(HierarchicalNavigation, with_ball),
         FootstepLibrary,
         actuations=('position',),
         samples='plans',
@@ -114,7 +113,7 @@ TYPES = (
     _tracking('footsteps', False, footsteps.PlanarFootsteps, Clip),
     _tracking('footsteps', True, footsteps.SpatialFootsteps, FootstepLibrary),
     _planned('goal_navigation'),
-    _planned('soccer', ball=Ball),
+    _planned('soccer', with_ball=True),
     TaskType(
         'direct_navigation', 'direct_navigation', True, direct.DirectNavigationConfig, _direct, Clip
     ),
@@ -123,7 +122,7 @@ TYPES = (
         'direct_soccer',
         True,
         direct.DirectConfig,
-        tracking(direct.DirectNavigation, ball=Ball),
+        tracking(direct.DirectNavigation, with_ball=True),
         Clip,
     ),
     TaskType(

@@ -52,7 +52,7 @@ PLAN = Block(
 SOLE, SOLE_AHEAD = (
     (0.0885, 0.045, 0.004),
     0.052,
-)  # m; half sizes of markers, distance ahead of the ankle
+)  # m; half sizes of markers, distance from the ankle
 SWING_COLOUR, STANCE_COLOUR = (
     (0.95, 0.55, 0.1, 0.9),
     (0.15, 0.45, 0.9, 0.9),

@@ -56,7 +56,7 @@ TERMS = (  # of the reward of a cycle; weights are those of the character
 _FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
-_OVER, _GROUND, _LOOK = range(3)  # why `go_on` returns: the step is over, the ground, or `watch`
+OVER, GROUND, LOOK = range(3)  # why `go_on` returns: the step is over, the ground, or `watch`
 
 
 class GaitTaskState(NamedTuple):
@@ -162,7 +162,7 @@ def go_on(i: int, watched: bool, data: GaitData) -> int:
     state = data.state
     while state.going[i]:
         if state.lasted[i] % _FRAME_STEPS == 0 and has_left(i, data.body):
-            return _GROUND
+            return GROUND
         gaits.act(i, data.gait)
         for k in range(data.gait.scratch.torque.shape[1]):
             data.body.ctrl[i, data.body.drive.first + k] = data.gait.scratch.torque[i, k]
@@ -177,8 +177,8 @@ def go_on(i: int, watched: bool, data: GaitData) -> int:
                 set_gait(i, data)
         state.going[i] = not (over or data.outcome.failed[i])
         if watched and i == 0 and state.age[i] % _FRAME_STEPS == 0:
-            return _LOOK
-    return _OVER
+            return LOOK
+    return OVER
 
 
 @compiled
@@ -295,7 +295,7 @@ def run(env_ids: np.ndarray, watched: bool, data: GaitData) -> int:
     interrupted = 0
     for i in env_ids:
         data.interruption[i] = go_on(i, watched, data)
-        interrupted += data.interruption[i] != _OVER
+        interrupted += data.interruption[i] != OVER
     return interrupted
 
 

@@ -24,25 +24,7 @@ from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
 from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, flat_ground
-from trl_suite.tasks.gait.rules import (
-    _GROUND,
-    _LOOK,
-    AHEAD,
-    BEHIND,
-    FRAME,
-    INTERFACES,
-    SAMPLES,
-    SUBSTEPS,
-    TERMS,
-    UPSTREAM_CENTRE,
-    GaitData,
-    GaitTaskState,
-    begin_steps,
-    finish_steps,
-    observe_all,
-    observed_blocks,
-    run,
-)
+from trl_suite.tasks.gait import rules
 from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import Task, check_simulated
 from trl_suite.terrain import PlanarGround
@@ -60,7 +42,7 @@ class GaitConfig(GroundConfig):
         "and +-1 differs from it by the largest deviation of any base action; 'base_action': a step is "
         '1/30 s, an action has one preference per base action, and the base action with the largest '
         'preference is used when the next cycle begins',
-        choices=INTERFACES,
+        choices=rules.INTERFACES,
     )
     base_actions: str = option(
         'default',
@@ -69,7 +51,10 @@ class GaitConfig(GroundConfig):
         choices=BASE_ACTIONS,
     )
     substeps: int = option(
-        SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1, at_most=MOST_SUBSTEPS
+        rules.SUBSTEPS,
+        'physics steps per control step of 1/600 s',
+        at_least=1,
+        at_most=MOST_SUBSTEPS,
     )
     spawn: str = flat_ground()
     start_noise: float = option(
@@ -90,7 +75,7 @@ class GaitTask(Task):
         steps; for rendering.
     """
 
-    state: GaitTaskState
+    state: rules.GaitTaskState
     fields = dynamics.FIELDS
     watch: Callable[[], None] | None = None
 
@@ -112,12 +97,12 @@ class GaitTask(Task):
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
         self.steps_vary = interface == 'parameters'
-        self.figure = PlanarBody(character, arena, BEHIND, AHEAD, SAMPLES)
+        self.figure = PlanarBody(character, arena, rules.BEHIND, rules.AHEAD, rules.SAMPLES)
         parameters = load(character.spec.name, config.base_actions)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
         timestep = CONTROL_TIMESTEP / config.substeps
-        self.set_timesteps(FRAME, timestep)
+        self.set_timesteps(rules.FRAME, timestep)
         self._torques = actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned for joints without these
             joint.damping = joint.armature = 0
@@ -133,9 +118,9 @@ class GaitTask(Task):
                 tuple(f'base_action_{i}' for i in range(count)), 'preference', '1',
                 np.zeros(count), np.ones(count),
             )  # fmt: skip
-        self.observed = observed_blocks(self.figure.blocks, character.spec, parameters)
+        self.observed = rules.observed_blocks(self.figure.blocks, character.spec, parameters)
         self.terms = tuple(
-            dataclasses.replace(term, weight=parameters.reward[term.name]) for term in TERMS
+            dataclasses.replace(term, weight=parameters.reward[term.name]) for term in rules.TERMS
         )
 
     @property
@@ -156,7 +141,7 @@ class GaitTask(Task):
         measured = np.zeros((n, sum(block.size for block in figure.blocks)))
         figure.bind(world, self._torques, measured, figure.blocks)
         gait.bind(world)
-        self.state = allocated(GaitTaskState, n, action=np.zeros(len(self.action_map)))
+        self.state = allocated(rules.GaitTaskState, n, action=np.zeros(len(self.action_map)))
         self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
         self.saved = (self.state, gait.state, self.outcome)
         self.info_arrays |= {
@@ -168,7 +153,7 @@ class GaitTask(Task):
         parameters, spec = gait.parameters, self.character.spec
         stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
         pitch = parameters.observe_pitch
-        self.data = GaitData(
+        self.data = rules.GaitData(
             body=figure.data,
             gait=gait.rules,
             terms=terms_data(self.terms),
@@ -205,7 +190,7 @@ class GaitTask(Task):
         for each in (order, mirrored):
             pairs = 2 * each[:, None] + np.arange(2)
             pose, velocity = pairs[1:] + body.pose + 1, pairs + body.velocity
-            terrain = np.arange(SAMPLES) + body.terrain
+            terrain = np.arange(rules.SAMPLES) + body.terrain
             parts = terrain, [body.pose], pose.ravel(), velocity.ravel()
             arranged.append(np.concatenate(parts))
         return np.array(arranged)
@@ -236,32 +221,32 @@ class GaitTask(Task):
                 self.terrain_seed(i, random_state),
                 terrain_level=self.config.terrain_level,
                 spawn=self.config.spawn,
-                centre=UPSTREAM_CENTRE,
+                centre=rules.UPSTREAM_CENTRE,
             )
             self.arena.begin_episode(i, strip)
         self.world.reset(env_ids)
         self.figure.place(env_ids, poses, rates, extents)
         for array in (*self.state, *self.outcome[1:]):  # all but the observation
             array[env_ids] = 0
-        observe_all(env_ids, True, self._pack)
+        rules.observe_all(env_ids, True, self._pack)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        begin_steps(env_ids, action, self._pack)
+        rules.begin_steps(env_ids, action, self._pack)
 
     def simulate(self, env_ids: np.ndarray) -> None:
         """Runs each simulation to the end of its cycle, or for 1/30 s."""
         interruption = self.data.interruption
-        while run(env_ids, self.watch is not None, self._pack):
-            leaving = env_ids[interruption[env_ids] == _GROUND]
+        while rules.run(env_ids, self.watch is not None, self._pack):
+            leaving = env_ids[interruption[env_ids] == rules.GROUND]
             if len(leaving):
                 self.figure.recentre(leaving)
-            if self.watch is not None and (interruption[env_ids] == _LOOK).any():
+            if self.watch is not None and (interruption[env_ids] == rules.LOOK).any():
                 self.watch()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])
-        finish_steps(env_ids, self._pack)
+        rules.finish_steps(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
-        observe_all(env_ids, False, self._pack)
+        rules.observe_all(env_ids, False, self._pack)

@@ -31,9 +31,7 @@ from trl_suite.tasks.tracking import TrackingData, TrackingTask, proceed, publis
 from trl_suite.util.compiled import compiled
 from trl_suite.util.options import option
 
-GOAL_AHEAD = (
-    3.0  # m; distance of the goal ahead of the root, on the line along +x through the start
-)
+GOAL_AHEAD = 3.0  # m; distance of the goal from the root, along +x on the line through the start
 REFERENCE = 'observe the state of the reference instead of the phase'
 
 

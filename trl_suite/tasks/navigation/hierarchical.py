@@ -42,23 +42,7 @@ from trl_suite.tasks.common.goals import (
     GoalTask,
     soccer_terms,
 )
-from trl_suite.tasks.navigation.hierarchical_rules import (
-    CONTROLLER,
-    FARTHEST_GOAL,
-    GOAL_REACHED,
-    MAPS,
-    NAVIGATION_TERMS,
-    SURFACE,
-    ControllerData,
-    PlanningData,
-    PlanningState,
-    begin_steps,
-    finish_all,
-    finish_control_steps,
-    observe_all,
-    score_all,
-    show_plans,
-)
+from trl_suite.tasks.navigation import hierarchical_rules as rules
 from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import Marker, check_simulated, drawn_seed
 from trl_suite.util.options import Range, option
@@ -79,7 +63,7 @@ class HierarchicalConfig(GroundConfig):
     """Options of `HierarchicalNavigation`."""
 
     controller: Any = option(
-        CONTROLLER,
+        rules.CONTROLLER,
         (
             'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
             'of its file, or a function'
@@ -92,7 +76,7 @@ class HierarchicalConfig(GroundConfig):
         'targets, and a plan takes effect only in a step that begins a footstep',
         choices=INTERFACES,
     )
-    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=rules.MAPS)
     step_length: float = option(
         STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0
     )
@@ -104,7 +88,7 @@ class HierarchicalConfig(GroundConfig):
     )
     goal_reached: float | None = option(
         None,
-        f'distance within which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
+        f'distance within which a goal is reached, by default {rules.GOAL_REACHED:g}, or a ball is at its goal, '
         f'by default {AT_GOAL:g}',
         unit='m',
         above=0,
@@ -115,7 +99,7 @@ class HierarchicalConfig(GroundConfig):
         'the terrain determines where goals are drawn',
         unit='m',
         at_least=0,
-        at_most=FARTHEST_GOAL,
+        at_most=rules.FARTHEST_GOAL,
     )
     start_phases: Sequence[float] = option(
         (0.1, 0.6),
@@ -141,7 +125,6 @@ class HierarchicalNavigation(Planned, GoalTask):
 
     ABOUT, RULE = 'root', 'far'
     length = 0.5
-    observe_all = observe_all
     watch: Callable[[], None] | None = None
 
     CONFIG: Any = HierarchicalConfig
@@ -171,7 +154,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         """
         check_two_feet(character.spec)
         self.ball, self.goal_distance = ball, config.goal_distance
-        self.terms = soccer_terms() if ball else NAVIGATION_TERMS
+        self.terms = soccer_terms() if ball else rules.NAVIGATION_TERMS
         super().__init__(character, arena, steps, config, actuation_model)
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
@@ -186,7 +169,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
-            (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
+            (AT_GOAL if ball else rules.GOAL_REACHED) if reached is None else float(reached)
         )
         self.steps_vary = by_plan = self.interface == 'plan'
         if by_plan:
@@ -202,7 +185,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         )
         self.observed = (
             terrain,
-            SURFACE.observed_if('velocity' in config.terrain_observation),
+            rules.SURFACE.observed_if('velocity' in config.terrain_observation),
             *body,
             BALL_GOAL if ball else GOAL,
             BALL.observed_if(ball is not None),
@@ -215,9 +198,9 @@ class HierarchicalNavigation(Planned, GoalTask):
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
 
-    def _bind(self, world: World) -> PlanningData:
+    def _bind(self, world: World) -> rules.PlanningData:
         n, blocks = world.n, self._controller_blocks
-        self.plan, self.state = allocated(FootstepPlan, n), allocated(PlanningState, n)
+        self.plan, self.state = allocated(FootstepPlan, n), allocated(rules.PlanningState, n)
         self.saved = (*self.saved, self.plan, self.state)
         aims = self._bind_goals(world, float(self.config.target_speed))
         self.info_arrays |= {
@@ -229,18 +212,18 @@ class HierarchicalNavigation(Planned, GoalTask):
         self._controller_observation = np.zeros((n, sum(block.size for block in blocks)))
         self._joint_action = np.zeros((n, len(self.joint_map)))
         self.figure.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
-        return PlanningData(
+        return rules.PlanningData(
             body=self.figure.data,
             outcome=self.outcome,
             clock=self.clock,
             travel=self.travel,
             period=self.period,
-            controller=ControllerData(columns(blocks), self._controller_observation),
+            controller=rules.ControllerData(columns(blocks), self._controller_observation),
             plan=self.plan,
             aims=aims,
             state=self.state,
             columns=columns(self.observed),
-            terms=terms_data(NAVIGATION_TERMS),
+            terms=terms_data(rules.NAVIGATION_TERMS),
             by_plan=self.interface == 'plan',
             plan_offset=self.action_map.action_offset,
             plan_scale=self.action_map.action_scale,
@@ -280,7 +263,7 @@ class HierarchicalNavigation(Planned, GoalTask):
     # A step.
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        begin_steps(env_ids, action, self._pack)
+        rules.begin_steps(env_ids, action, self._pack)
         if self.interface == 'frame':
             self._joint_action[env_ids] = np.clip(action[env_ids, len(PLAN_NAMES) :], -1.0, 1.0)
 
@@ -292,7 +275,7 @@ class HierarchicalNavigation(Planned, GoalTask):
                 self._joint_action[going] = self.controller(self._controller_observation[going])
             self.figure.control(going, self._joint_action)
             self.world.step(self.config.substeps, going)
-            count = finish_control_steps(going, self._pack)
+            count = rules.finish_control_steps(going, self._pack)
             if self.watch is not None:
                 self.watch()
             if count < len(going):
@@ -312,17 +295,19 @@ class HierarchicalNavigation(Planned, GoalTask):
         Raises:
           ValueError: actions of the wrong shape, or with NaN or infinity.
         """
-        show_plans(self.world.all_ids, self.action_map.checked(action, self.world.n), self._pack)
+        rules.show_plans(
+            self.world.all_ids, self.action_map.checked(action, self.world.n), self._pack
+        )
         return self._controller_observation.copy()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])
-        if score_all(env_ids, self._pack):
+        if rules.score_all(env_ids, self._pack):
             self._redraw_goals(env_ids)
-        finish_all(env_ids, self._pack)
+        rules.finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+        rules.observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the plan, past positions of the centre of mass, and the goal."""

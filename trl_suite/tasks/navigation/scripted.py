@@ -15,10 +15,8 @@ from trl_suite.tasks.common.footstep_plan import SIDE
 from trl_suite.tasks.navigation.hierarchical import PLAN_NAMES, HierarchicalNavigation
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
-LENGTH, SHORT = (
-    1.3,
-    1.0,
-)  # step length, and that in turns or near the goal; in units of task.step_length
+# Step length, and that in turns or near the goal, in units of task.step_length.
+LENGTH, SHORT = 1.3, 1.0
 CAUTIOUS = 0.5  # step length if an obstacle is close, in the same units
 ROOM = 2.0  # m; distance at which an obstacle is close
 WIDTH = 0.15  # m; distance between the feet to the side
