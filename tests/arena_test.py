@@ -194,8 +194,10 @@ class DynamicsTest(parameterized.TestCase):
     """Bodies on boxes that were moved after compiling."""
 
     @parameterized.parameters(
-        ('gaps_humanoid', 0.0), ('cliffs_rugged', 9.0), ('steps_humanoid', 48.0),
-    )  # fmt: skip
+        ('gaps_humanoid', 0.0),
+        ('cliffs_rugged', 9.0),
+        ('steps_humanoid', 48.0),
+    )
     def test_a_ball_rests_at_the_exact_height(self, source, x):
         ball = {'type': 'sphere', 'size': (0.1,), 'mass': 1}
         ground = Stage(source, 2, body=ball)

@@ -148,9 +148,10 @@ class ActionMapTest(parameterized.TestCase):
         rigid = np.repeat(body.ranges[:, 1] < 0.1, body.sizes)
         rigid &= np.repeat(body.ranges[:, 0] > -0.1, body.sizes)
         reach = {
-            'torque': 0.75 * np.repeat(body.limits, body.sizes), 'velocity': 10 * np.pi,
+            'torque': 0.75 * np.repeat(body.limits, body.sizes),
+            'velocity': 10 * np.pi,
             'position': np.where(rigid, 0.04, 1.5),
-        }[model]  # fmt: skip
+        }[model]
         np.testing.assert_allclose(mapping.action_scale, reach)
         self.assertFalse(mapping.action_offset.any())
         small = 0.5 * np.random.default_rng(0).uniform(-1, 1, (5, len(mapping)))
@@ -237,8 +238,10 @@ class AngleAxisTest(parameterized.TestCase):
 
     @parameterized.parameters(
         # First index, kind, value at action 0 and change per unit of each part.
-        ('biped3d', 0, 'torso_angle', 0, 4), ('biped3d', 4, 'right_hip_angle', 0, 10.28),
-        ('biped3d', 8, 'right_knee', -1.57, 6.28), ('biped3d', 9, 'right_ankle_angle', 0, 6.28),
+        ('biped3d', 0, 'torso_angle', 0, 4),
+        ('biped3d', 4, 'right_hip_angle', 0, 10.28),
+        ('biped3d', 8, 'right_knee', -1.57, 6.28),
+        ('biped3d', 9, 'right_ankle_angle', 0, 6.28),
         ('biped3d_mocap', 12, 'right_ankle_right', 0.2, 1),
         ('biped3d_mocap', 17, 'left_knee', -1.57, 6.28),
         ('biped3d_mocap_run', 5, 'right_hip_forward', 0, 1),
@@ -247,7 +250,7 @@ class AngleAxisTest(parameterized.TestCase):
         ('biped3d_simbicon', 0, 'right_hip_angle', 0, 4.2),
         ('biped3d_simbicon', 4, 'right_knee', -1.25, 5),
         ('biped3d_simbicon', 5, 'right_ankle_angle', 0, 3.14),
-    )  # fmt: skip
+    )
     def test_map_of_the_original(self, name, i, part, zero, per_unit):
         mapping = self.make(name).map
         self.assertEqual(mapping.names[i], part)

@@ -225,8 +225,9 @@ class PlanTest(parameterized.TestCase):
         far, near = np.abs(turns) > 5 * turn, np.abs(turns) < turn
         self.assertLess(np.abs(turns).max(), np.pi)
         for found, probability in (
-            (far, sharp * (1 - 5 * turn / np.pi)), (near, (1 - sharp) * 0.6827 + sharp * turn / np.pi)
-        ):  # fmt: skip
+            (far, sharp * (1 - 5 * turn / np.pi)),
+            (near, (1 - sharp) * 0.6827 + sharp * turn / np.pi),
+        ):
             deviation = np.sqrt(probability * (1 - probability) / len(turns))
             self.assertAlmostEqual(found.mean(), probability, delta=4 * deviation)
         self.assertAlmostEqual(turns[~far].mean(), 0, delta=0.12 * turn)
@@ -273,12 +274,14 @@ class PlanTest(parameterized.TestCase):
     @parameterized.parameters(
         *(('biped3d_mocap', name) for name in ('hills3d', 'stairs3d', 'trail3d2')),
         *(('biped2d_full', name) for name in ('slopes_humanoid', 'gaps_humanoid')),
-    )  # fmt: skip
+    )
     def test_places_lie_on_the_ground(self, character, preset):
         environment = suite.build(
-            character, terrain=preset, task='footsteps',
+            character,
+            terrain=preset,
+            task='footsteps',
             task_kwargs={'random': 4, 'step_limit': None, 'start_phase': 0.4},
-        )  # fmt: skip
+        )
         task = environment.task
 
         def height(x, y):

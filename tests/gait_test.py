@@ -18,10 +18,11 @@ RAPTOR, BIPED = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0'
 HOPPER = 'FSM_Hopper2D_Terrain_Mixed_Easy-v0'
 EXAMPLES = (DOG, GOAT, RAPTOR, BIPED, HOPPER)
 EXEMPT = {  # links that may touch the ground without a stumble
-    DOG: ('toe', 'finger', 'ankle', 'wrist'), HOPPER: ('leg',),
+    DOG: ('toe', 'finger', 'ankle', 'wrist'),
+    HOPPER: ('leg',),
     RAPTOR: ('right_toe', 'left_toe', 'right_ankle', 'left_ankle'),
     BIPED: ('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
-}  # fmt: skip
+}
 EXEMPT[GOAT] = EXEMPT[DOG]
 TARGETS = {DOG: 4.0, GOAT: 2.0, RAPTOR: 4.0, BIPED: 3.0, HOPPER: 3.0}
 # x, z, pitch rate of the root at the start.
@@ -488,10 +489,11 @@ REFUSED = (
     ({'terrain_observation': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
 )  # fmt: skip
 DO_NOT_FIT = (
-    (('dog', 'torque'), {}, 'unknown actuation .*; known: gait'), (('dog',), {'clip': 'dog_bound'}, 'no clip'),
+    (('dog', 'torque'), {}, 'unknown actuation .*; known: gait'),
+    (('dog',), {'clip': 'dog_bound'}, 'no clip'),
     (('biped2d',), {}, "unknown character with a gait 'biped2d'"),
     (('dog', 'gait'), {'task': 'imitation'}, "unknown actuation .*'gait'"),
-)  # fmt: skip
+)
 
 
 class OptionTest(parameterized.TestCase):

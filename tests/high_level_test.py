@@ -585,8 +585,10 @@ class ScriptedTest(parameterized.TestCase):
             made(SOCCER, seed=1, flat=True, **more)
             for more in ({'rewards': {'idle': (0.1, lambda task: np.zeros(task.world.n))}}, {})
         )
-        actions = [scripted.scripted(each)(each.reset().observation['observations'][None])
-                   for each in (own, plain)]  # fmt: skip
+        actions = [
+            scripted.scripted(each)(each.reset().observation['observations'][None])
+            for each in (own, plain)
+        ]
         np.testing.assert_array_equal(*actions)
 
     def test_walks_around_obstacles(self):

@@ -510,11 +510,12 @@ class ResetTest(parameterized.TestCase):
         np.testing.assert_allclose(data.qvel[figure.pose_dof], rate, atol=near[1])
 
     @parameterized.parameters(
-        (FLAT, {}, ((0, 1),)), (PLANE, {}, ((0, 1),)),
+        (FLAT, {}, ((0, 1),)),
+        (PLANE, {}, ((0, 1),)),
         (BIPED, {'start_phase': ((0.1, 0.2), (0.5, 0.8))}, ((0.1, 0.2), (0.5, 0.8))),
         # A raptor with muscles starts in the air.
         ('MTU_Raptor2D_LLC_Imitate_Flat-v0', {}, ((0.25, 0.5), (0.75, 1.0))),
-    )  # fmt: skip
+    )
     def test_phases_are_uniform(self, id_, options, ranges):
         environments = VectorEnvironment(id_, 400, 1, seed=5, task_kwargs=options)
         environments.reset()

@@ -228,9 +228,10 @@ class ShapeTest(parameterized.TestCase):
 
 class ObstaclesTest(parameterized.TestCase):
     @parameterized.parameters(
-        ('blocks3d', 96, (0.5, 7), (1, 5), 0.18), ('pillars3d', 640, (0.75, 0.75), (2, 8), 0.05),
+        ('blocks3d', 96, (0.5, 7), (1, 5), 0.18),
+        ('pillars3d', 640, (0.75, 0.75), (2, 8), 0.05),
         ('steps3d', 3200, (0.5, 3), (0.06, 0.14), 0.76),
-    )  # fmt: skip
+    )
     def test_counts_sizes_and_cover(self, source, count, side, height, cover):
         ground = terrain.load(source)
         covered = []

@@ -110,9 +110,10 @@ class ProcessTest(parameterized.TestCase):
 
     @parameterized.parameters(
         # Levels of floors or crests, their widths, and the ground between them, m.
-        ('gaps', (-2, -2), (0.5, 2), (4, 7)), ('gaps_hopper', (-2.5, -2), None, None),
+        ('gaps', (-2, -2), (0.5, 2), (4, 7)),
+        ('gaps_hopper', (-2.5, -2), None, None),
         ('walls_humanoid', (0.05, 0.25), None, (2, 4)),
-    )  # fmt: skip
+    )
     def test_boxes(self, name, levels, widths, between):
         counts, found = runs(draw(name, 10_000.0))
         box = found != 0
@@ -138,10 +139,11 @@ class ProcessTest(parameterized.TestCase):
         self.assert_lengths(counts[1:-1] - 1, 5, 7)
 
     @parameterized.parameters(
-        ((0.0, 0.0), (0.2, 0.3), {1}), ((-0.3, -0.2), (0.0, 0.0), {-1}),
+        ((0.0, 0.0), (0.2, 0.3), {1}),
+        ((-0.3, -0.2), (0.0, 0.0), {-1}),
         ((0.0, 0.2), (-0.2, 0.0), {-1, 1}),  # one end at 0 does not switch a range off
         ((0.0, 0.0), (0.0, 0.0), set()),
-    )  # fmt: skip
+    )
     def test_range_of_rises(self, first, second, directions):
         step = planar('steps', StepSpacingMin=0, StepSpacingMax=0, StepH0Min=first[0],
                       StepH0Max=first[1], StepH1Min=second[0], StepH1Max=second[1])  # fmt: skip
