@@ -629,12 +629,12 @@ REFUSED = (
         ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
         ({'action_scale': np.inf}, 'action_scale is inf'),
         ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),
+        ({'action_scale': 1.0, 'action_offset': 'original'}, 'takes no action_scale'),
         ({'plans': {}}, "unknown option.*'plans'"),
     )),
     (BIPED, {'terrain_observation': -1}, 'terrain_observation is -1'),
     (BIPED, {'spawn': 'nowhere'}, "spawn 'nowhere'"),
     (PLANE, {'substeps': 5}, 'substeps is 5'),
-    (PLANE, {'action_scale': 1.0, 'action_offset': 'original'}, 'takes no action_scale'),
     (PLANE, {'mirrored': True, 'reference_observation': True}, 'mirrored observations need the phase'),
     (PLANE, {'terrain_observation': 50}, 'terrain_observation is 50; expected a string'),
 )  # fmt: skip

@@ -364,14 +364,6 @@ class Ball:
         lasts = random.uniform(*BALL_LASTS)
         self.state.due[env_id] = count + round(lasts / CONTROL_TIMESTEP)
 
-    def goal(
-        self, env_id: int, random: np.random.Generator, away: tuple[float, float] = GOAL_AWAY
-    ) -> np.ndarray:
-        """Draws a goal (3,) m at a distance from one ball between two bounds, m."""
-        return np.append(
-            self.world.qpos[env_id, self.qpos[:2]] + random_displacement(random, *away), 0.0
-        )
-
 
 class GoalTask(BodyTask):
     """A walker that goes from goal to goal, or dribbles a ball to them.
@@ -448,7 +440,8 @@ class GoalTask(BodyTask):
     def _draw_goal(self, i: int, place: np.ndarray) -> None:
         random, distance = self._random[i], self.goal_distance
         if self.ball:
-            goal = self.ball.goal(i, random, distance or GOAL_AWAY)
+            away = random_displacement(random, *(distance or GOAL_AWAY))
+            goal = np.append(self.ball.place[i, :2] + away, 0.0)
         elif distance is None:
             goal = self.arena.goal(i, random, place, self.RULE)
         else:
