@@ -145,7 +145,7 @@ class LearnTest(FolderTest):
         self.assertEqual(np.abs(changes).max() > 0.1, action != 'discrete')
 
     def test_actors_learn_from_noise_that_pays_and_values_from_the_rest(self):
-        learner = make(action='both', begin=1e9, minibatch=32, updates=1)
+        learner = make(action='both', begin=1e9, minibatch=32, updates=1, learning_rate=3e-3)
         for _ in range(4):
             learner.collect()
         replay, size = learn_gaits.Replay(64, len(learner.columns), 3), learner.choices.shape[1]
@@ -158,7 +158,7 @@ class LearnTest(FolderTest):
             action = learn_gaits.Action(1, change, kind < 2)
             replay.add(before, action, reward, 0.0, before)
         learner.replay = replay
-        for _ in range(2000):
+        for _ in range(700):
             learner.learn()
         with torch.no_grad():
             values, changes = learner.network.both(learner.seen(before[None].astype(float)))

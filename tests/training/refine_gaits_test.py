@@ -90,7 +90,8 @@ class RefineTest(FolderTest):
         np.testing.assert_allclose(batch['advantage'], batch['target'])
 
     def test_it_selects_what_pays_more_often(self):
-        refiner, _ = make(num_envs=8, value_first=0, learning_rate=1e-3, kl=1.0, horizon=16)
+        rates = {'learning_rate': 3e-3, 'kl': 1.0}
+        refiner, _ = make(num_envs=8, value_first=0, horizon=16, minibatch=32, **rates)
         chosen, better = [], 3
 
         def run(taken):
@@ -99,7 +100,7 @@ class RefineTest(FolderTest):
             return (number == better).astype(float), np.ones(8, bool), None
 
         refiner.learner.run = run
-        for _ in range(40):
+        for _ in range(20):
             refiner.advance()
         self.assertGreater(np.mean(chosen[-16:]), 0.9)
         self.assertLess(np.mean(chosen[:16]), 0.6)
