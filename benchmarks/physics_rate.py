@@ -136,13 +136,13 @@ class Subject:
             self.data.qpos[moved] += random.normal(0, noise, len(moved))
             mujoco.mj_forward(self.model, self.data)
         if self.on_terrain:
-            heights = self.task.figure.ground_heights
-            before = heights(0, np.zeros(1)).max()
+            height = self.task.arena.height
+            before = height(np.zeros((1, 1))).max()
             x, z = self.root_qpos
             self.data.qpos[x] = ON_TERRAIN
             self.task.arena.recentre(np.zeros(1, int), np.array([ON_TERRAIN]))
             around = ON_TERRAIN + np.linspace(-REACH, REACH, 49)
-            self.data.qpos[z] += heights(0, around).max() - before
+            self.data.qpos[z] += height(around[None]).max() - before
             mujoco.mj_forward(self.model, self.data)
 
     def step(self, action):
