@@ -142,7 +142,7 @@ class EngineTest(parameterized.TestCase):
     def test_motors_without_effect_leave_every_bit(self):
         model = mujoco.MjModel.from_xml_string(XML)
         plain, other = BatchWorld(model, 3, 1), BatchWorld(model, 3, 1)
-        other.set_motors(motors.limits(), motors.noise(), 0, 0)
+        other.set_motors(motors.Limits(), motors.Noise(), 0, 0)
         for control in np.random.default_rng(0).uniform(-1, 1, (60, 3, 2)):
             for world in (plain, other):
                 world.ctrl[:] = control

@@ -43,7 +43,7 @@ READERS = (
     ('a.amc', lambda path: motion.read_amc(path, path)),
     ('a.npz', motion.load), ('a.npz', motion.load_steps), ('a.npz', policies.load),
     ('a.json', lambda path: terrain.load(str(path))), ('a.json', sequences.read),
-    ('a.json', lambda path: strength_curves.load(path, None, 'dog', ('hip',))),
+    ('a.json', lambda path: strength_curves.load(path, characters.CHARACTERS['dog'])),
     *((f'a{suffix}', terrain.from_mesh) for suffix in terrain.mesh.READ),
     *((f'a{suffix}', lambda path: terrain.from_image(path, 1)) for suffix in terrain.custom.IMAGES),
 )  # fmt: skip

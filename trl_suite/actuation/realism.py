@@ -12,16 +12,15 @@ prismatic joint read m for rad and N for N m.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from trl_suite.actuation import series, strength_curves
-from trl_suite.actuation.strength_curves import Curve
+from trl_suite.actuation import series
 from trl_suite.characters.character import Character, CharacterSpec
-from trl_suite.engine import World, motors
+from trl_suite.engine import motors
 from trl_suite.util.options import Config, Range, option, within
 
 NOISE_TIME = 0.02  # s; correlation time of the torque noise
@@ -159,16 +158,6 @@ class Units:
         self.dof_limits = np.repeat(self.limits, sizes)
 
 
-def curves_of(actuators: Actuators, character: Character) -> dict[str, Curve]:
-    """Returns the factors of torque limits by joint angle, by joint."""
-    if actuators.torque_pose is None:
-        return {}
-    spec = character.spec
-    return strength_curves.load(
-        actuators.torque_pose, spec.torque_curves, spec.name, tuple(spec.joints)
-    )
-
-
 def body(actuators: Actuators, spec: CharacterSpec) -> CharacterSpec:
     """Returns the character with free play and springs in its joints, if there are any."""
     if not (actuators.backlash or actuators.flex):
@@ -177,103 +166,53 @@ def body(actuators: Actuators, spec: CharacterSpec) -> CharacterSpec:
 
 
 def limits(
-    actuators: Actuators, units: Units, model: mujoco.MjModel, curves: Mapping[str, Curve]
+    actuators: Actuators, units: Units, model: mujoco.MjModel, curves: Mapping[str, motors.Curves]
 ) -> motors.Limits:
     """Returns the limits of motors that depend on speed and pose."""
     if not (actuators.torque_speed or curves):
-        return motors.limits()
-    ball = model.jnt_type[units.joints] == mujoco.mjtJoint.mjJNT_BALL
-    place = {name: k for k, name in enumerate(curves)}
-    rows = dict(curves)
-    for name, turns in zip(units.names, ball, strict=True):
-        if (
-            turns and name in curves
-        ):  # the engine takes rotations about y, and tables have those about -y
-            angle, positive, negative = curves[name]
-            rows[name] = Curve(-angle[::-1], negative[::-1], positive[::-1])
-    single: list[tuple[Any, ...]] = []
-    balls: list[tuple[Any, ...]] = []
-    for unit, (ids, joint, limit) in enumerate(
-        zip(units.actuators, units.joints, units.limits, strict=True)
+        return motors.Limits()
+    axes: list[tuple[float, ...]] = []
+    balls: list[tuple[float, ...]] = []
+    rows: list[motors.Curves] = []
+    for unit, (name, ids, joint, limit) in enumerate(
+        zip(units.names, units.actuators, units.joints, units.limits, strict=True)
     ):
-        qpos, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        curve = place.get(units.names[unit], -1)
-        if not ball[unit]:
-            single.append((ids[0], qpos, dof, limit, unit, curve, 1))
-        elif len(ids) == 3 and model.actuator_biastype[ids[0]] != mujoco.mjtBias.mjBIAS_NONE:
+        qpos, dof, first = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), ids[0]
+        ball, curve = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL, -1
+        if name in curves:
+            angle, positive, negative = curves[name]
+            if ball:  # the engine takes rotations about y, and tables have those about -y
+                angle, positive, negative = -angle[::-1], negative[::-1], positive[::-1]
+            curve = len(rows)
+            rows.append(motors.Curves(angle, positive, negative))
+        if not ball:
+            axes.append((first, qpos, dof, limit, unit, curve, 1))
+        elif len(ids) == 3 and model.actuator_biastype[first] != mujoco.mjtBias.mjBIAS_NONE:
             # Velocity servos, each with a limit of its own.
-            each = model.actuator_forcerange[ids[0], 1]
-            single += [
-                (ids[k], qpos, dof + k, each, unit, curve if k == _LATERAL else -1, -1)
-                for k in range(3)
-            ]
+            each = model.actuator_forcerange[first, 1]
+            for k in range(3):
+                own = curve if k == _LATERAL else -1
+                axes.append((ids[k], qpos, dof + k, each, unit, own, -1))
         else:
-            group = [*ids, -1, -1][:3]
-            balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, curve))
-    speed = actuators.no_load_speed if actuators.torque_speed else np.inf
-    braking = actuators.braking if actuators.torque_speed else 1.0
-    return motors.limits(
-        _columns(single, 3), _columns(balls, 4), _table([*rows.values()]), speed, braking
-    )
-
-
-def _table(curves: Sequence[Curve]) -> motors.Curves | None:
-    """Returns curves as a table, whose rows repeat their last knots; None if there are no curves."""
-    if not curves:
-        return None
-    most = max(len(curve.angle) for curve in curves)
-    columns = [
-        [np.pad(values, (0, most - len(values)), 'edge') for values in field]
-        for field in zip(*curves, strict=True)
-    ]
-    return motors.Curves(*map(np.array, columns))
-
-
-def _columns(rows: list[tuple[Any, ...]], reals: int) -> tuple[np.ndarray, ...] | None:
-    """Returns the columns of a table as arrays of integers; column `reals` as floats."""
-    if not rows:
-        return None
-    return tuple(
-        np.array(column, float if k == reals else int)
-        for k, column in enumerate(zip(*rows, strict=True))
-    )
+            output = model.actuator_outadr[first]
+            balls.append((first, len(ids), output, qpos, dof, limit, unit, curve))
+    found = motors.Limits(motors.table(motors.Axes, axes), motors.table(motors.Balls, balls))
+    if rows:  # of one length: they repeat their last knots
+        most = max(len(curve.angle) for curve in rows)
+        columns = zip(*rows, strict=True)
+        padded = ([np.pad(v, (0, most - len(v)), 'edge') for v in column] for column in columns)
+        found = found._replace(curves=motors.Curves(*map(np.array, padded)))
+    if actuators.torque_speed:
+        found = found._replace(no_load=actuators.no_load_speed, braking=actuators.braking)
+    return found
 
 
 def noise(actuators: Actuators, units: Units, timestep: float) -> motors.Noise:
     """Returns the torque noise."""
     if not actuators.noise:
-        return motors.noise()
+        return motors.Noise()
     deviation = actuators.noise * units.dof_limits
-    return motors.noise(units.dofs, deviation, float(np.exp(-timestep / NOISE_TIME)))
-
-
-class Strength:
-    """Scales the torques of motors and muscles in the models of simulations."""
-
-    def __init__(self, actuators: Actuators, units: Units, world: World) -> None:
-        """Keeps the nominal values; limits that the engine writes replace those of the models."""
-        self._units, self._models, model = units, world.models, world.models[0]
-        self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
-        self._force, self._joint = model.actuator_forcerange.copy(), model.jnt_actfrcrange.copy()
-        if actuators.torque_speed or actuators.torque_pose is not None:
-            for each in world.models:  # only the motors' limits count
-                each.jnt_actfrclimited[units.joints] = False
-                for ids in units.actuators:
-                    each.actuator_forcelimited[ids] = True
-
-    def apply(self, env_id: int, strength: np.ndarray) -> None:
-        """Sets the strength of each unit of a simulation, (U,)."""
-        model, units = self._models[env_id], self._units
-        # Numbers of the parameters that are proportional to torque: a muscle's peak force; gains.
-        scaled = slice(2, 3) if units.muscles else slice(0, 3)
-        for unit, ids in enumerate(units.actuators):
-            factor = strength[unit]
-            model.actuator_gainprm[ids, scaled] = self._gain[ids, scaled] * factor
-            model.actuator_biasprm[ids, scaled] = self._bias[ids, scaled] * factor
-            if not units.muscles:
-                model.actuator_forcerange[ids] = self._force[ids] * factor
-                joint = units.joints[unit]
-                model.jnt_actfrcrange[joint] = self._joint[joint] * factor
+    return motors.Noise(units.dofs, deviation, float(np.exp(-timestep / NOISE_TIME)))
 
 
 def check(actuators: Actuators, actuation: str) -> None:

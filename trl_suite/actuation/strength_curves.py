@@ -27,6 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.characters.character import CharacterSpec
+from trl_suite.engine.motors import Curves
 from trl_suite.util import errors, files
 
 HUMAN = 'human'
@@ -57,15 +59,7 @@ ANDERSON_2007 = {
 _FORWARD = {'hip': True, 'knee': False, 'ankle': True}
 
 
-class Curve(NamedTuple):
-    """Factors of the limits of a joint by its angle, (knots,)."""
-
-    angle: np.ndarray
-    positive: np.ndarray
-    negative: np.ndarray
-
-
-def human(joint: str) -> Curve | None:
+def human(joint: str) -> Curves | None:
     """Returns the curve of a joint whose name ends in hip, knee or ankle; None for other joints.
 
     Positive angles and torques of the joint must swing the limb forward.
@@ -82,7 +76,7 @@ def human(joint: str) -> Curve | None:
         for name, each in exertions.items()
     }
     positive, negative = ('flexion', 'extension') if forward else ('extension', 'flexion')
-    return Curve(angle, factors[positive], factors[negative])
+    return Curves(angle, factors[positive], factors[negative])
 
 
 def _cosine(angle: np.ndarray) -> np.ndarray:
@@ -90,24 +84,25 @@ def _cosine(angle: np.ndarray) -> np.ndarray:
     return np.where(np.abs(angle) < np.pi / 2, np.cos(angle), 0.0)
 
 
-def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -> dict[str, Curve]:
-    """Returns the curves by joint of a character.
+def load(given: Any, character: CharacterSpec) -> dict[str, Curves]:
+    """Returns the curves of a character by joint.
 
-    What is given is True for its own, whose name is `own`, 'human', a JSON file, or a table.
+    What is given is True for its own, 'human', a JSON file, or a table; None for no curves.
     """
+    if given is None:
+        return {}
+    name, joints = character.name, character.joints
     if given is True:
-        if own is None:
+        if character.torque_curves is None:
             raise ValueError(
-                f'torque_pose: character {character!r} has no curves of its own; give a table of '
+                f'torque_pose: character {name!r} has no curves of its own; give a table of '
                 'joint -> angle, positive, negative'
             )
-        given = own
+        given = character.torque_curves
     if given == HUMAN:
         curves = {joint: curve for joint in joints if (curve := human(joint)) is not None}
         if not curves:
-            raise ValueError(
-                f'torque_pose: {character!r} has no joint that ends in hip, knee or ankle'
-            )
+            raise ValueError(f'torque_pose: {name!r} has no joint that ends in hip, knee or ankle')
         return curves
     if isinstance(given, (str, pathlib.Path)):
         with errors.naming('torque_pose: cannot read the table', (OSError, ValueError)):
@@ -116,11 +111,11 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
         raise ValueError(
             f"torque_pose is {given!r}; expected True, 'human', a JSON file, or a table by joint"
         )
-    errors.check_known(f'joint of {character!r} in torque_pose', joints, *given)
+    errors.check_known(f'joint of {name!r} in torque_pose', joints, *given)
     return {joint: _curve(joint, entry) for joint, entry in given.items()}
 
 
-def _curve(joint: str, entry: Any) -> Curve:
+def _curve(joint: str, entry: Any) -> Curves:
     """Returns a checked curve of a table."""
     owner = f'torque_pose[{joint!r}]'
     if not isinstance(entry, Mapping) or set(entry) != set(_FIELDS):
@@ -133,4 +128,4 @@ def _curve(joint: str, entry: Any) -> Curve:
     for name, factors in (('positive', positive), ('negative', negative)):
         if not ((factors >= 0) & (factors <= MOST)).all():
             raise ValueError(f'{owner}: {name} is {factors}; expected numbers from 0 to {MOST:g}')
-    return Curve(angle, positive, negative)
+    return Curves(angle, positive, negative)

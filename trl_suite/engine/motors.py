@@ -17,6 +17,7 @@ torque, v the component of the angular velocity along it, and the pose factor th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -32,6 +33,7 @@ UNLIMITED = 1e10  # N m
 class Curves(NamedTuple):
     """Factors of torque limits by joint angle, for positive and negative torques, (curves, knots).
 
+    Of a single curve, (knots,).
     Between the knots they are interpolated, beyond the ends constant.
     """
 
@@ -40,20 +42,17 @@ class Curves(NamedTuple):
     negative: np.ndarray
 
 
-class Limits(NamedTuple):
-    """Motors with limits that depend on speed or pose.
-
-    S motors act about one axis, B groups of motors on ball joints have a limited norm.
+class Axes(NamedTuple):
+    """Motors about one axis whose limits depend on speed or pose, S of them.
 
     Attributes:
-      actuator: actuator of each motor, (S,); up to three actuators of each group, -1 for none, (B, 3).
-      output: address of the torque of each group in actuator_force, (B,).
+      actuator: id of the actuator.
       qpos, dof: addresses in qpos and in qvel: of the joint's position, and of the motor's own axis.
       limit: torque limit without these factors, N m.
-      unit: number of the motor's strength.
-      curve: number of the curve in `curves`; -1 for none.
-      axis: +1 if the angle of the curve is qpos itself; -1 if the angle is the y component of the
-        rotation vector of a ball joint, (S,).
+      unit: index of the motor's strength.
+      curve: index of the curve in `curves`; -1 for none.
+      sign: +1 if the angle of the curve is qpos itself; -1 if it is the y component of the rotation
+        vector of a ball joint.
     """
 
     actuator: np.ndarray
@@ -62,21 +61,47 @@ class Limits(NamedTuple):
     limit: np.ndarray
     unit: np.ndarray
     curve: np.ndarray
-    axis: np.ndarray
-    ball_actuator: np.ndarray
-    ball_output: np.ndarray
-    ball_qpos: np.ndarray
-    ball_dof: np.ndarray
-    ball_limit: np.ndarray
-    ball_unit: np.ndarray
-    ball_curve: np.ndarray
-    curves: Curves
-    no_load: float
-    braking: float
+    sign: np.ndarray
+
+
+class Balls(NamedTuple):
+    """Motors of ball joints, the norm of whose torque is limited, B of them.
+
+    Attributes:
+      actuator: id of the first actuator.
+      actuators: how many there are: one for the whole torque, or three, with consecutive ids.
+      output: address of the torque in actuator_force.
+      qpos, dof, limit, unit, curve: as of `Axes`; dof is the first of the joint.
+    """
+
+    actuator: np.ndarray
+    actuators: np.ndarray
+    output: np.ndarray
+    qpos: np.ndarray
+    dof: np.ndarray
+    limit: np.ndarray
+    unit: np.ndarray
+    curve: np.ndarray
+
+
+def table(kind: Any, rows: Sequence[tuple[float, ...]]) -> Any:
+    """Returns `Axes` or `Balls` with an array for each column of some rows."""
+    types = (float if name == 'limit' else int for name in kind._fields)
+    return kind(*(np.array([row[k] for row in rows], type_) for k, type_ in enumerate(types)))
+
+
+class Limits(NamedTuple):
+    """Limits of motors that depend on speed or pose; by default none."""
+
+    axes: Axes = table(Axes, [])
+    balls: Balls = table(Balls, [])
+    curves: Curves = Curves(*np.zeros((3, 0, 1)))
+    no_load: float = math.inf
+    braking: float = 1.0
 
 
 class Noise(NamedTuple):
-    """Torque noise: an Ornstein-Uhlenbeck process for each of D degrees of freedom.
+    """Torque noise: an Ornstein-Uhlenbeck process for each of D degrees of freedom; by default none.
 
     Attributes:
       dof: addresses in qvel, (D,).
@@ -84,9 +109,9 @@ class Noise(NamedTuple):
       decay: factor by which the process decays in a physics step.
     """
 
-    dof: np.ndarray
-    deviation: np.ndarray
-    decay: float
+    dof: np.ndarray = np.zeros(0, int)
+    deviation: np.ndarray = np.zeros(0)
+    decay: float = 0.0
 
 
 class MotorState(NamedTuple):
@@ -129,31 +154,6 @@ class Motors(NamedTuple):
     state: MotorState
 
 
-def limits(
-    single: tuple[np.ndarray, ...] | None = None,
-    balls: tuple[np.ndarray, ...] | None = None,
-    curves: Curves | None = None,
-    no_load: float = np.inf,
-    braking: float = 1.0,
-) -> Limits:
-    """Returns limits; by default none. See `Limits` for the order of the arrays."""
-    none, reals = np.zeros(0, int), np.zeros(0)
-    single = single or (none, none, none, reals, none, none, none)
-    balls = balls or (np.zeros((0, 3), int), none, none, none, reals, none, none)
-    curves = curves or Curves(*np.zeros((3, 0, 1)))
-    fields: tuple[Any, ...] = (*single, *balls, curves, no_load, braking)
-    return Limits(*fields)
-
-
-def noise(
-    dof: np.ndarray | None = None, deviation: np.ndarray | None = None, decay: float = 0.0
-) -> Noise:
-    """Returns noise; by default none."""
-    if dof is None or deviation is None:
-        return Noise(np.zeros(0, int), np.zeros(0), decay)
-    return Noise(dof, deviation, decay)
-
-
 def motors(
     models: list[mujoco.MjModel],
     data: list[mujoco.MjData],
@@ -181,34 +181,30 @@ def motors(
         ]
         for model, each in zip(models, data, strict=True)
     ]  # fmt: skip
-    state = _state(len(models), units, slots, models[0].nu, len(noise.dof))
-    return Motors(np.array(fields, np.int64), limits, noise, state)
-
-
-def _state(n: int, units: int, slots: int, controls: int, dofs: int) -> MotorState:
-    """Allocates the state of n simulations."""
-    return MotorState(
+    n, dofs = len(models), len(noise.dof)
+    state = MotorState(
         strength=np.ones((n, units)),
         lag=np.zeros(n, int),
         age=np.zeros(n, int),
         given=np.zeros(n, int),
         used=np.zeros(n, int),
         times=np.zeros((n, slots), int),
-        controls=np.zeros((n, slots, controls)),
+        controls=np.zeros((n, slots, models[0].nu)),
         noise=np.zeros((n, dofs)),
         stream=random.Streams(n).state,
     )
+    return Motors(np.array(fields, np.int64), limits, noise, state)
 
 
 @compiled_inline
 def get(address: int, k: int) -> float:
-    """Returns number k of the floats at an address."""
+    """Returns float k at an address."""
     return floats_at(address, k + 1)[k]
 
 
 @compiled_inline
 def put(address: int, k: int, value: float) -> None:
-    """Writes number k of the floats at an address."""
+    """Writes float k at an address."""
     floats_at(address, k + 1)[k] = value
 
 
@@ -226,21 +222,14 @@ def pose_factor(curve: int, angle: float, positive: bool, curves: Curves) -> flo
     """Factor of the limit of positive or negative torques at a joint angle."""
     if curve < 0:
         return 1.0
-    values = curves.positive if positive else curves.negative
-    low, high = 0, curves.angle.shape[1] - 1
-    if not angle > curves.angle[curve, low]:
-        return values[curve, low]
-    if angle >= curves.angle[curve, high]:
-        return values[curve, high]
-    while high - low > 1:
-        middle = (low + high) // 2
-        if angle < curves.angle[curve, middle]:
-            high = middle
-        else:
-            low = middle
-    begin, end = curves.angle[curve, low], curves.angle[curve, high]
+    angles = curves.angle[curve]
+    values = curves.positive[curve] if positive else curves.negative[curve]
+    after = np.searchsorted(angles, angle, side='right')
+    if after == 0 or after == len(angles):
+        return values[0] if after == 0 else values[-1]
+    begin, end = angles[after - 1], angles[after]
     share = (angle - begin) / (end - begin)
-    return values[curve, low] + share * (values[curve, high] - values[curve, low])
+    return values[after - 1] + share * (values[after] - values[after - 1])
 
 
 @compiled
@@ -258,65 +247,64 @@ def lateral_angle(qpos: int, first: int) -> float:
 
 
 @compiled
-def limit_single(i: int, motors: Motors) -> None:
+def limit_axes(i: int, motors: Motors) -> None:
     """Writes the force ranges of the motors that act about one axis."""
-    own, ranges = motors.limits, motors.fields[i, RANGE]
-    for k in range(len(own.actuator)):
-        v = get(motors.fields[i, QVEL], own.dof[k])
-        limit = own.limit[k] * motors.state.strength[i, own.unit[k]]
+    own, axes, fields = motors.limits, motors.limits.axes, motors.fields
+    for k in range(len(axes.actuator)):
+        v = get(fields[i, QVEL], axes.dof[k])
+        limit = axes.limit[k] * motors.state.strength[i, axes.unit[k]]
         high = limit * speed_factor(v, own.no_load, own.braking)
         low = limit * speed_factor(-v, own.no_load, own.braking)
-        if own.curve[k] >= 0:
-            if own.axis[k] < 0:
-                angle = lateral_angle(motors.fields[i, QPOS], own.qpos[k])
+        if axes.curve[k] >= 0:
+            if axes.sign[k] < 0:
+                angle = lateral_angle(fields[i, QPOS], axes.qpos[k])
             else:
-                angle = get(motors.fields[i, QPOS], own.qpos[k])
-            high *= pose_factor(own.curve[k], angle, True, own.curves)
-            low *= pose_factor(own.curve[k], angle, False, own.curves)
-        put(ranges, 2 * own.actuator[k], -low)
-        put(ranges, 2 * own.actuator[k] + 1, high)
+                angle = get(fields[i, QPOS], axes.qpos[k])
+            high *= pose_factor(axes.curve[k], angle, True, own.curves)
+            low *= pose_factor(axes.curve[k], angle, False, own.curves)
+        put(fields[i, RANGE], 2 * axes.actuator[k], -low)
+        put(fields[i, RANGE], 2 * axes.actuator[k] + 1, high)
 
 
 @compiled
 def free_balls(i: int, motors: Motors) -> None:
     """Removes the limits of the motors of ball joints, so that MuJoCo computes what they intend."""
-    own, ranges = motors.limits, motors.fields[i, RANGE]
-    for group in range(len(own.ball_limit)):
-        whole = own.ball_actuator[group, 1] < 0  # one actuator, whose range bounds a norm
-        for k in range(1 if whole else 3):
-            actuator = own.ball_actuator[group, k]
-            put(ranges, 2 * actuator, 0.0 if whole else -UNLIMITED)
-            put(ranges, 2 * actuator + 1, UNLIMITED)
+    balls, ranges = motors.limits.balls, motors.fields[i, RANGE]
+    for ball in range(len(balls.limit)):
+        least = 0.0 if balls.actuators[ball] == 1 else -UNLIMITED  # a single range bounds a norm
+        for k in range(balls.actuator[ball], balls.actuator[ball] + balls.actuators[ball]):
+            put(ranges, 2 * k, least)
+            put(ranges, 2 * k + 1, UNLIMITED)
 
 
 @compiled
 def limit_balls(i: int, motors: Motors) -> None:
     """Writes the force ranges of the motors of ball joints, from the torques that they intend."""
-    own, fields = motors.limits, motors.fields
+    own, balls, fields = motors.limits, motors.limits.balls, motors.fields
     ranges = fields[i, RANGE]
-    for group in range(len(own.ball_limit)):
-        first, dof = own.ball_output[group], own.ball_dof[group]
+    for ball in range(len(balls.limit)):
+        first, dof, actuator = balls.output[ball], balls.dof[ball], balls.actuator[ball]
         x, y = get(fields[i, FORCE], first), get(fields[i, FORCE], first + 1)
         z = get(fields[i, FORCE], first + 2)
         norm = math.sqrt(x * x + y * y + z * z)
-        limit = own.ball_limit[group] * motors.state.strength[i, own.ball_unit[group]]
+        limit = balls.limit[ball] * motors.state.strength[i, balls.unit[ball]]
         if norm > 0.0:
             v = x * get(fields[i, QVEL], dof) + y * get(fields[i, QVEL], dof + 1)
             v = (v + z * get(fields[i, QVEL], dof + 2)) / norm
             limit *= speed_factor(v, own.no_load, own.braking)
-            if own.ball_curve[group] >= 0:
-                angle = lateral_angle(fields[i, QPOS], own.ball_qpos[group])
-                factor = pose_factor(own.ball_curve[group], angle, y > 0.0, own.curves)
+            if balls.curve[ball] >= 0:
+                angle = lateral_angle(fields[i, QPOS], balls.qpos[ball])
+                factor = pose_factor(balls.curve[ball], angle, y > 0.0, own.curves)
                 across = y / max(factor, 1e-9)
                 limit *= norm / math.sqrt(x * x + across * across + z * z)
-        if own.ball_actuator[group, 1] < 0:
-            put(ranges, 2 * own.ball_actuator[group, 0] + 1, limit)
+        if balls.actuators[ball] == 1:
+            put(ranges, 2 * actuator + 1, limit)
             continue
         share = min(1.0, limit / norm) if norm > 0.0 else 1.0
         for k in range(3):
             bound = abs(get(fields[i, FORCE], first + k)) * share
-            put(ranges, 2 * own.ball_actuator[group, k], -bound)
-            put(ranges, 2 * own.ball_actuator[group, k] + 1, bound)
+            put(ranges, 2 * (actuator + k), -bound)
+            put(ranges, 2 * (actuator + k) + 1, bound)
 
 
 @compiled
@@ -387,5 +375,5 @@ def prepare(i: int, motors: Motors) -> None:
     delay(i, motors)
     if len(motors.noise.dof) > 0:
         add_noise(i, motors)
-    limit_single(i, motors)
+    limit_axes(i, motors)
     motors.state.age[i] += 1

@@ -21,7 +21,7 @@ _PATTERNS = ('libmujoco.so*', 'libmujoco*.dylib', 'mujoco.dll')
 _GROUPS = '3.17.'  # versions with `mj_setConstGroups`
 _TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 # The warnings of bad position, velocity and acceleration have consecutive numbers.
-_BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 _WARNING_STRIDE = 8  # bytes; mjWarningStat has two ints, the second of which is the counter
 
 
@@ -199,7 +199,7 @@ def step_motors(i: int, nstep: int, engine: Engine, own: motors.Motors | None) -
     motors.give(i, own)
     for _ in range(nstep):
         motors.prepare(i, own)
-        if len(own.limits.ball_limit) > 0:
+        if len(own.limits.balls.limit) > 0:
             # The limit of a ball joint depends on the direction of the torque that it intends.
             motors.free_balls(i, own)
             call(engine.functions[ACTUATION], model, data)
@@ -229,7 +229,7 @@ def reset(i: int, engine: Engine) -> None:
 @compiled
 def diverged(i: int, engine: Engine) -> bool:
     """Returns whether a simulation has had a non-finite or huge state since its reset."""
-    for k in range(_BAD[0], _BAD[1]):
+    for k in range(BAD[0], BAD[1]):
         if ints_at(engine.warnings[i] + _WARNING_STRIDE * k, 1)[0] > 0:
             return True
     return False
@@ -266,13 +266,3 @@ def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Resets simulations to the model's initial state."""
     for i in env_ids:
         reset(i, engine)
-
-
-@compiled
-def diverged_all(engine: Engine, out: np.ndarray) -> bool:
-    """Writes which simulations have diverged; returns whether any has."""
-    found = False
-    for i in range(len(out)):
-        out[i] = diverged(i, engine)
-        found |= out[i]
-    return found

@@ -21,20 +21,9 @@ HEAVY = ('mass', 'link_mass', 'inertia', 'com_offset')
 
 
 class Properties(NamedTuple):
-    """Properties of n simulations.
+    """Properties of n simulations, (n,), in the units of the options in `WorldConfig`.
 
-    Attributes:
-      friction: coefficient of sliding friction of all contacts, (n,).
-      mass: factor of mass and inertia of all links, (n,).
-      link_mass: factor of mass and inertia of each link, (n, L).
-      inertia: factor of the inertia of all links about their centres of mass, (n,).
-      com_offset: displacement of the first link's centre of mass in its own frame, (n, 3) m.
-      damping: factor of the passive damping of the joints, (n,).
-      gravity: magnitude of gravity, (n,) m/s^2.
-      slope: angle by which the ground is tilted, (n,) rad.
-      slope_direction: direction of the steepest ascent, to the left of +x, (n,) rad.
-      contact_depth: depth over which the impedance of contacts rises from 0, (n,) m.
-      contact_time: time constant of contacts, (n,) s.
+    link_mass has a factor for each link, (n, L). com_offset is in the frame of the first link, (n, 3).
     """
 
     friction: np.ndarray

@@ -12,6 +12,7 @@ import copy
 import os
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -130,8 +131,7 @@ class World:
           The state of the motors, to be drawn at the start of episodes, saved and restored.
         """
         made = motors.motors(self.models, self._data, limits, noise, units, slots)
-        self.engine = self.engine._replace(motors=made)
-        self.pack = packed(self.engine)
+        self._extend(motors=made)
         return made.state
 
     def add_pushes(self) -> int:
@@ -141,9 +141,12 @@ class World:
         """
         series = 0 if self.engine.pushes is None else len(self.engine.pushes.body)
         applied = np.array([address(each.xfrc_applied) for each in self._data])
-        self.engine = self.engine._replace(pushes=pushes.no_pushes(applied, series + 1))
-        self.pack = packed(self.engine)
+        self._extend(pushes=pushes.no_pushes(applied, series + 1))
         return series
+
+    def _extend(self, **parts: Any) -> None:
+        self.engine = self.engine._replace(**parts)
+        self.pack = packed(self.engine)
 
     # Methods for tasks; env_ids are sorted indices of simulations, without repeats. Those that do not
     # exist raise an IndexError.
@@ -196,9 +199,7 @@ class World:
 
     def diverged(self) -> np.ndarray:
         """Returns which simulations have had a non-finite or huge state since their reset, (n,)."""
-        found = np.empty(self.n, bool)
-        native.diverged_all(self.pack, found)
-        return found
+        return np.array([data.warning.number[slice(*native.BAD)].any() for data in self._data])
 
     @property
     def time(self) -> np.ndarray:

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.actuation import realism, series
+from trl_suite.actuation import realism, series, strength_curves
 from trl_suite.actuation.realism import Actuators
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.tasks.component import MOTORS, Component, spawned
-from trl_suite.util import random
+from trl_suite.tasks.component import MOTORS, Component, seeded, spawned
 
 if TYPE_CHECKING:
     from trl_suite.tasks.rewards import Outcome
@@ -28,18 +27,13 @@ class Motors(Component):
     """
 
     def __init__(self, actuators: Actuators, character: Character) -> None:
-        """Keeps the options.
-
-        Args:
-          actuators: the options.
-          character: the character whose joints are driven, made from what `realism.body` returns; it
-            has its actuators.
+        """Keeps the options; the character is made from what `realism.body` returns.
 
         Raises:
           ValueError: an option that does not suit the character.
         """
         self.actuators, self._character = actuators, character
-        self._curves = realism.curves_of(actuators, character)
+        self._curves = strength_curves.load(actuators.torque_pose, character.spec)
 
     def added_to(self, task: Task) -> None:
         super().added_to(task)
@@ -52,7 +46,7 @@ class Motors(Component):
 
     def prepare(self, world: World) -> None:
         model, actuators = world.models[0], self.actuators
-        units = realism.Units(self._character, model)
+        self._units = units = realism.Units(self._character, model)
         self._timestep = world.engine.timestep
         longest = self._steps(actuators.delay.high)
         slots = longest // self.task.steps_per_call + 2 if longest else 0
@@ -63,9 +57,13 @@ class Motors(Component):
             slots,
         )
         self.saved = (self.motors,)
-        self._streams = random.Streams(0)
-        self._streams.state = self.motors.stream
-        self._strength = realism.Strength(actuators, units, world)
+        # Nominal values; limits that the engine writes replace those of the models.
+        self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+        self._force, self._joint = model.actuator_forcerange.copy(), model.jnt_actfrcrange.copy()
+        if actuators.torque_speed or actuators.torque_pose is not None:
+            for each in world.models:  # only the motors' limits count
+                each.jnt_actfrclimited[units.joints] = False
+                each.actuator_forcelimited[np.concatenate(units.actuators)] = True
         self._delay, self._age = np.zeros(world.n), np.zeros(world.n)
         self._info: dict[str, np.ndarray] = {}
         if 'strength' in actuators.changed:
@@ -76,9 +74,21 @@ class Motors(Component):
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         self.info_arrays = self._info
-        for env_id in world.all_ids.tolist():
-            self._strength.apply(env_id, self.motors.strength[env_id])
         return outcome
+
+    def _strengthen(self, env_id: int) -> None:
+        """Scales the torques of the motors or muscles of a simulation by their strengths."""
+        model, units = self.task.world.models[env_id], self._units
+        # Numbers of the parameters that are proportional to torque: a muscle's peak force; gains.
+        scaled = slice(2, 3) if units.muscles else slice(0, 3)
+        for unit, ids in enumerate(units.actuators):
+            factor = self.motors.strength[env_id, unit]
+            model.actuator_gainprm[ids, scaled] = self._gain[ids, scaled] * factor
+            model.actuator_biasprm[ids, scaled] = self._bias[ids, scaled] * factor
+            if not units.muscles:
+                model.actuator_forcerange[ids] = self._force[ids] * factor
+                joint = units.joints[unit]
+                model.jnt_actfrcrange[joint] = self._joint[joint] * factor
 
     def _steps(self, delay: float) -> int:
         """Returns a delay in ms as physics steps."""
@@ -91,7 +101,7 @@ class Motors(Component):
         state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
         state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
         state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
-        self._streams.seed(env_id, own.spawn(1)[0])
+        seeded(env_id, own.spawn(1)[0], self.motors.stream)
         self.restored(env_id)
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
@@ -106,4 +116,4 @@ class Motors(Component):
 
     def restored(self, env_id: int) -> None:
         self._delay[env_id] = 1000 * self._timestep * self.motors.lag[env_id]
-        self._strength.apply(env_id, self.motors.strength[env_id])
+        self._strengthen(env_id)
