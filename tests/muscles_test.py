@@ -9,7 +9,7 @@ from absl.testing import parameterized
 from dm_control import composer, mjcf
 
 from trl_suite import actuation, characters, suite
-from trl_suite.actuation import hill, muscles
+from trl_suite.actuation import muscles
 
 TIMESTEP = 1 / 300  # s
 ISOMETRIC_ERROR = 0.05  # peak forces; largest error of the active force-length curve
@@ -219,10 +219,10 @@ class HillTest(parameterized.TestCase):
 
     def test_moment_arms(self):
         constant = muscles.Arm('hip', -0.094, 0.5)
-        self.assertEqual(hill.constant_arm(constant), -0.094)
+        self.assertEqual(muscles.constant_arm(constant), -0.094)
         for off, share in ((0, 1), (-math.pi / 3, 0.5), (-0.7, math.cos(0.7)), (2.2616, 0)):
             cosine = muscles.Arm('knee', 0.056, -0.2616 + off, -0.2616)  # never turns its sign
-            self.assertAlmostEqual(hill.constant_arm(cosine), 0.056 * share)
+            self.assertAlmostEqual(muscles.constant_arm(cosine), 0.056 * share)
 
 
 class MujocoTest(parameterized.TestCase):

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from dm_control import mjcf
 
-from trl_suite.actuation import hill
 from trl_suite.actuation.action_map import AXIS_OFFSET, ActionMap
-from trl_suite.actuation.muscles import MUSCLES, PLAIN, Muscle
+from trl_suite.actuation.muscles import MUSCLES, PLAIN, Muscle, constant_arm, mujoco_parameters
 from trl_suite.characters.character import Character
 from trl_suite.util import errors
 
@@ -250,9 +249,9 @@ def _add_muscle(
         tendon = character.mjcf_model.tendon.add('fixed', name=unit.name)
         for arm in unit.arms:
             # In MuJoCo the moment is d length / d angle, and a muscle's force is negative.
-            tendon.add('joint', joint=joints[arm.joint], coef=-hill.constant_arm(arm))
+            tendon.add('joint', joint=joints[arm.joint], coef=-constant_arm(arm))
         character.mjcf_model.actuator.add(
-            'general', name=unit.name, tendon=tendon, **hill.mujoco_parameters(unit)
+            'general', name=unit.name, tendon=tendon, **mujoco_parameters(unit)
         )
     names, count = tuple(unit.name for unit in units), len(units)
     offset, scale = np.full(count, EXCITATION_OFFSET), np.full(count, EXCITATION_SCALE)

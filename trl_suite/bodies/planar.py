@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.actuation import hill
 from trl_suite.actuation.action_map import drive
-from trl_suite.actuation.muscles import Muscle
+from trl_suite.actuation.muscles import Muscle, optimal_length, rest_length
 from trl_suite.arenas import PlanarArena
 from trl_suite.bodies.blocks import HEIGHTS, PLACES, SPEEDS, Block, Noise
 from trl_suite.bodies.body import (
@@ -249,8 +248,8 @@ class PlanarBody(Body):
             samples=self._samples,
             fall=world.sensor_addresses(self._fall_sensors).astype(int),
             contact=world.sensor_addresses(self._contact_sensors).astype(int),
-            rest=np.array([hill.rest_length(muscle) for muscle in self._muscles]),
-            scale=np.array([hill.optimal_length(muscle) for muscle in self._muscles]),
+            rest=np.array([rest_length(muscle) for muscle in self._muscles]),
+            scale=np.array([optimal_length(muscle) for muscle in self._muscles]),
         )
 
     def _ground(self) -> PlanarWindows:
