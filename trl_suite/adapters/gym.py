@@ -46,7 +46,7 @@ except ImportError as error:
 METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most ids
 BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; others are unbounded
 RENDER_OPTIONS = tuple(inspect.signature(rendering.frame).parameters)[1:]
-ONE_OBJECT = 'simulations share one object'
+_ONE_OBJECT = 'simulations share one object'
 Info = dict[str, Any]
 
 
@@ -88,16 +88,15 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         if not isinstance(environment, Environment):
             spec = catalogue.spec_of(environment)
             environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
-        elif task_kwargs or max_episode_steps is not None:
-            raise ValueError(
-                'task_kwargs and max_episode_steps cannot change an environment that is already made'
-            )
+        else:
+            check_none(task_kwargs, max_episode_steps)
         self.environment, self.render_mode = environment, render_mode
         self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
         self.metadata = metadata(environment.task)
         shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
-        self.observation_space = observation_space(shapes, flat_observation, self._dtype)
-        self.action_space = action_space(environment, self._dtype)
+        self.observation_space, self.action_space = spaces_of(
+            environment, shapes, flat_observation, self._dtype
+        )
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Starts an episode, seeded if `seed`, in [0, 2**32), is given.
@@ -146,7 +145,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     """
 
     def __init__(
-        self, environment: str | EnvSpec, num_envs: int = 1, *, num_threads: int = 0,
+        self, environment: str | EnvSpec | VectorEnvironment, num_envs: int = 1, *, num_threads: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         flat_observation: bool = True, task_kwargs: Info | None = None,
         dtype: DTypeLike = np.float32, max_episode_steps: int | None = None,
@@ -155,31 +154,36 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         """Makes the environment; the other arguments and errors are those of `SuiteEnv`.
 
         Args:
+          environment: id, alias, `EnvSpec`, or a vector environment that is not used elsewhere, for
+            which only `render_mode` and `render_kwargs` have an effect.
           num_envs: number of simulations.
           num_threads: threads that step the physics; 0 for all cores.
           autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's constants.
           dtype: dtype of observations, actions and rewards.
         """
-        modes = {mode.value: mode for mode in AutoresetMode}
-        mode = getattr(autoreset_mode, 'value', autoreset_mode)
-        if mode not in modes:
-            raise ValueError(errors.unknown('autoreset_mode', mode, modes))
-        self.autoreset_mode = modes[mode]  # as in Gymnasium; TorchRL reads it
-        spec = catalogue.spec_of(environment)
-        options = limited(task_kwargs, max_episode_steps)
-        self.environment = made = VectorEnvironment(
-            spec, num_envs, num_threads, options.pop('random', None),
-            autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
-            task_kwargs=options,
-        )  # fmt: skip
-        self.num_envs, self.render_mode = made.num_envs, render_mode
-        self._render_kwargs = rendered(render_mode, render_kwargs, made.task)
-        self.metadata = {**metadata(made.task), 'autoreset_mode': modes[mode]}
-        shapes = {name: (part.stop - part.start,) for name, part in made.blocks.items()}
-        self.single_observation_space = observation_space(shapes, flat_observation, made.dtype)
-        self.single_action_space = action_space(made, made.dtype)
-        self.observation_space = batch_space(self.single_observation_space, made.num_envs)
-        self.action_space = batch_space(self.single_action_space, made.num_envs)
+        if not isinstance(environment, VectorEnvironment):
+            modes = {mode.value: mode.name.lower() for mode in AutoresetMode}
+            mode: Any = getattr(autoreset_mode, 'value', autoreset_mode)
+            errors.check_known('autoreset_mode', modes, mode)
+            options = limited(task_kwargs, max_episode_steps)
+            environment = VectorEnvironment(
+                environment, num_envs, num_threads, options.pop('random', None),
+                autoreset=modes[mode], dtype=dtype, flat_observation=flat_observation,
+                task_kwargs=options,
+            )  # fmt: skip
+        else:
+            check_none(task_kwargs, max_episode_steps)
+        self.environment, self.render_mode = environment, render_mode
+        self.num_envs, dtype = environment.num_envs, environment.dtype
+        self.autoreset_mode = AutoresetMode[environment.autoreset.upper()]  # TorchRL reads it
+        self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
+        self.metadata = {**metadata(environment.task), 'autoreset_mode': self.autoreset_mode}
+        shapes = {name: (part.stop - part.start,) for name, part in environment.blocks.items()}
+        self.single_observation_space, self.single_action_space = spaces_of(
+            environment, shapes, environment.flat_observation, dtype
+        )
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
@@ -219,25 +223,29 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         return tuple(self.environment.render(env_id, **self._render_kwargs) for env_id in env_ids)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Returns an attribute, or with the name 'render' the picture, of each simulation.
+        """Returns an attribute of this object or of `environment`, or the picture, of each simulation.
+
+        Of an array (n,), each simulation gets its own element.
 
         Raises:
           AttributeError: there is no such attribute.
-          RuntimeError: another method, since it would concern all simulations.
+          RuntimeError: a method other than 'render', since it would concern all simulations.
         """
         if name == 'render':
             return self.render() or (None,) * self.num_envs
-        values = attributes(self, f'single_{name}', name)
-        if callable(values[0]):
-            raise RuntimeError(f'{ONE_OBJECT}: call {name} of its `environment`')
-        return tuple(values)
+        owner = self if hasattr(self, name) else self.environment
+        value = getattr(owner, f'single_{name}' if hasattr(owner, f'single_{name}') else name)
+        if callable(value):
+            raise RuntimeError(f'{_ONE_OBJECT}: call {name} of its `environment`')
+        own = isinstance(value, np.ndarray) and value.shape == (self.num_envs,)
+        return tuple(value) if own else (value,) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Returns an attribute of each simulation; see `call`."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        raise RuntimeError(f'{ONE_OBJECT}: set {name} on its `environment`')
+        raise RuntimeError(f'{_ONE_OBJECT}: set {name} on its `environment`')
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulations."""
@@ -251,15 +259,20 @@ def metadata(task: Any) -> Info:
 
 def rendered(render_mode: str | None, render_kwargs: Info | None, task: Any) -> Info:
     """Returns `render_kwargs` if it and `render_mode` are valid for a task."""
-    if render_mode not in (None, 'rgb_array'):
-        raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
+    checked('render_mode', render_mode, str | None, '', ['rgb_array'])
     options = errors.options('render_kwargs', render_kwargs)
-    for name in options:
-        if name not in RENDER_OPTIONS:
-            raise ValueError(errors.unknown('option in render_kwargs', name, RENDER_OPTIONS))
+    errors.check_known('option in render_kwargs', RENDER_OPTIONS, *options)
     if render_mode or options:
         rendering.check_options(task.world.models[0], task, **options)
     return options
+
+
+def check_none(task_kwargs: Info | None, max_episode_steps: int | None) -> None:
+    """Raises a ValueError if an environment is given, and options of a new one as well."""
+    if task_kwargs or max_episode_steps is not None:
+        raise ValueError(
+            'task_kwargs and max_episode_steps cannot change an environment that is already made'
+        )
 
 
 def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
@@ -278,39 +291,18 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
     return options
 
 
-def observation_space(
-    shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any
-) -> gymnasium.Space[Any]:
-    """Returns the space of blocks of these shapes, flat or not."""
+def spaces_of(
+    environment: Environment | VectorEnvironment,
+    shapes: Mapping[str, tuple[int, ...]],
+    flat: bool,
+    dtype: Any,
+) -> tuple[spaces.Space[Any], spaces.Box]:
+    """Returns the spaces of one simulation: blocks of these shapes, flat or not; actions in [-1, 1]."""
     bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
-    boxes = [(name, spaces.Box(*bounds[name], shape, dtype)) for name, shape in shapes.items()]
     # Pairs, as Dict would sort the keys of a dict.
-    return spaces.flatten_space(spaces.Dict(boxes)) if flat else spaces.Dict(boxes)
-
-
-def action_space(environment: Environment | VectorEnvironment, dtype: Any) -> spaces.Box:
-    """Returns the action space of one simulation, [-1, 1] in every dimension."""
-    return spaces.Box(-1.0, 1.0, (len(environment.action_map),), dtype)
-
-
-def attributes(adapter: Any, *names: str) -> list[Any]:
-    """Returns an attribute of an adapter or of its `environment`, once for each simulation.
-
-    Args:
-      adapter: an object with the attributes `num_envs` and `environment`.
-      names: of the attribute; the first that exists counts. Of an array (n,), each simulation gets
-        its own element.
-
-    Raises:
-      AttributeError: there is no such attribute.
-    """
-    for owner in (adapter, adapter.environment):
-        for name in names:
-            if hasattr(owner, name):
-                value, n = getattr(owner, name), adapter.num_envs
-                own = isinstance(value, np.ndarray) and value.shape == (n,)
-                return list(value) if own else [value] * n
-    raise AttributeError(f'no attribute {names[-1]!r}')
+    blocks = spaces.Dict([(n, spaces.Box(*bounds[n], s, dtype)) for n, s in shapes.items()])
+    actions = spaces.Box(-1.0, 1.0, (len(environment.action_map),), dtype)
+    return (spaces.flatten_space(blocks) if flat else blocks), actions
 
 
 def flat(info: Info) -> Info:

@@ -17,14 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.adapters.gym import (
-    ONE_OBJECT,
-    action_space,
-    attributes,
-    flat,
-    observation_space,
-    rendered,
-)
+from trl_suite.adapters.gym import SuiteVectorEnv, flat
 from trl_suite.environments import arguments
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
@@ -50,40 +43,34 @@ class SuiteVecEnv(VecEnv):
 
     def __init__(
         self, environment: str | EnvSpec | VectorEnvironment, num_envs: int = 1,
-        num_threads: int = 0, seed: int | Sequence[int] | None = None, *, flat_observation: bool = True,
-        step_limit: int | None = -1, task_kwargs: dict[str, Any] | None = None,
-        render_mode: str | None = None, render_kwargs: dict[str, Any] | None = None,
+        num_threads: int = 0, seed: int | Sequence[int] | None = None, *,
+        render_mode: str | None = None, render_kwargs: dict[str, Any] | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Makes the environment; arguments that are not listed are those of `VectorEnvironment`.
 
         Args:
           environment: id, alias, or `EnvSpec`; or a vector environment with autoreset 'same_step',
             for which only `render_mode` and `render_kwargs` have an effect.
-          num_envs: number of simulations.
-          num_threads: threads that step the physics; 0 for all cores.
-          seed: one seed, from which that of each simulation is derived, or a sequence of n seeds.
-          flat_observation: return one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
           render_mode: 'rgb_array', or None for no rendering.
           render_kwargs: options of `trl_suite.rendering.frame`: height, width, camera, ghost.
+          **options: `step_limit`, `task_kwargs`, and `flat_observation`: True for 'MlpPolicy', False
+            for 'MultiInputPolicy'.
 
         Raises:
           ValueError: unknown names or options; the message has the closest matches.
         """
         if not isinstance(environment, VectorEnvironment):
+            usual: dict[str, Any] = {'autoreset': 'same_step', 'dtype': np.float32}
             environment = VectorEnvironment(
-                environment, num_envs, num_threads, seed, autoreset='same_step', dtype=np.float32,
-                flat_observation=flat_observation, step_limit=step_limit, task_kwargs=task_kwargs,
-            )  # fmt: skip
-        elif environment.autoreset != 'same_step':
+                environment, num_envs, num_threads, seed, **usual | options
+            )
+        if environment.autoreset != 'same_step':
             raise ValueError(f"autoreset is {environment.autoreset!r}; expected 'same_step'")
-        self.environment, self.render_mode = environment, render_mode
-        self._render_kwargs = rendered(render_mode, render_kwargs, environment.task)
-        shapes = {name: (part.stop - part.start,) for name, part in environment.blocks.items()}
-        super().__init__(
-            environment.num_envs,
-            observation_space(shapes, environment.flat_observation, environment.dtype),
-            action_space(environment, np.float32),
+        self.environment = environment
+        self._view = view = SuiteVectorEnv(
+            environment, render_mode=render_mode, render_kwargs=render_kwargs
         )
+        super().__init__(view.num_envs, view.single_observation_space, view.single_action_space)
 
     def seed(self, seed: int | None = None) -> list[int]:
         """Sets the seeds for the next reset; they are derived from one as in the constructor.
@@ -126,25 +113,20 @@ class SuiteVecEnv(VecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """Draws every simulation, (h, w, 3) uint8 each; None if render_mode is None."""
-        if self.render_mode is None:
-            return [None] * self.num_envs
-        return [
-            self.environment.render(env_id, **self._render_kwargs)
-            for env_id in range(self.num_envs)
-        ]
+        return list(self._view.call('render'))
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of this object or of `environment`, once for each index."""
-        values = attributes(self, attr_name)
+        """Returns an attribute of `environment`, once for each index; see `SuiteVectorEnv.call`."""
+        values = self._view.get_attr(attr_name)
         return [values[env_id] for env_id in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        raise RuntimeError(f'{ONE_OBJECT}: set {attr_name} on its `environment`')
+        self._view.set_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        raise RuntimeError(f'{ONE_OBJECT}: call {method_name} of its `environment`')
+        return self.get_attr(method_name, indices)  # refuses methods
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """Returns False for every simulation: none has a Gymnasium wrapper."""
