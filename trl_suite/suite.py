@@ -20,7 +20,6 @@ from typing import Any
 
 from trl_suite import actuation as actuation_models
 from trl_suite import characters, motion, policies
-from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import DIMENSIONS, build_task
@@ -151,49 +150,40 @@ def combine(
       ValueError: unknown names, or parts that are incompatible.
     """
     own: dict[str, Any] = {}
-    if not isinstance(character, (str, characters.CharacterSpec)):
+    if isinstance(character, characters.CharacterSpec):
+        own['character'], figure = character, character
+    elif isinstance(character, str):
+        errors.check_known('character', characters.CHARACTERS, character)
+        figure = characters.CHARACTERS[character]
+    else:
         raise TypeError(
             f'a character is a CharacterSpec or a name, one of {", ".join(characters.CHARACTERS)}; '
             f'not {character!r}'
         )
     if not isinstance(clip, (str, motion.Clip, motion.FootstepLibrary, type(None))):
         raise TypeError(f'clip is a name, a file, a Clip or FootstepLibrary, not {clip!r}')
-    if not isinstance(character, str):
-        own['character'], character = character, character.name
-    elif character not in characters.CHARACTERS:
-        raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
-    figure = own.get('character') or characters.CHARACTERS[character]
-    if isinstance(task, str):
-        title, type_ = task, _type(task, figure)
-        actuation = _actuation(type_, actuation)
-        if type_.motion is None and clip is not None:
-            raise ValueError(f'the task {title!r} has no reference motion: it takes no clip')
-        if clip is None and type_.motion is not None:
-            clip = _own_motion(figure, type_.motion)
-    elif isinstance(task, TaskType):
-        title, type_, own['task_type'] = task.title, task, task
-        _check_dimensions(task, figure)
-        actuation = _actuation(type_, actuation)
-        if clip is None and type_.motion is not None:
-            clip = _own_motion(figure, type_.motion)
-    elif callable(task):
-        title, type_ = str(getattr(task, '__name__', 'task')), None
-        own['task_type'], actuation = task, _actuation(None, actuation)
-    else:
-        raise TypeError(f'task is {task!r}; expected a title, a TaskType, or a class or function')
+    type_ = _type(task, figure)
+    if not isinstance(task, str):
+        own['task_type'] = task
+    title = str(getattr(task, '__name__', 'task')) if type_ is None else type_.title
+    actuation = _actuation(type_, actuation)
+    kind = motion.Clip if type_ is None else type_.motion
+    if kind is None and clip is not None:
+        raise ValueError(f'the task {title!r} has no reference motion: it takes no clip')
+    if clip is None and type_ is not None and kind is not None:
+        clip = _own_motion(figure, kind)
     if terrain is None:
         terrain = 'plane' if figure.spatial else 'flat'
     if isinstance(clip, str) and clip.endswith('.npz'):  # read once: the working folder may change
-        steps = type_ is not None and type_.motion is motion.FootstepLibrary
-        clip = motion.load_steps(clip) if steps else motion.load(clip)
+        clip = (motion.load_steps if kind is motion.FootstepLibrary else motion.load)(clip)
     if clip is not None and not isinstance(clip, str):
         own['clip'], clip = clip, clip.name
     ground = terrain if isinstance(terrain, str) else 'terrain'
     spec = EnvSpec(
-        id=f'{character}/{actuation}/{ground}/{title}',
+        id=f'{figure.name}/{actuation}/{ground}/{title}',
         domain='custom',
         task=title,
-        character=character,
+        character=figure.name,
         actuation=actuation,
         terrain=ground,
         task_type=title if type_ is None else type_.name,
@@ -205,51 +195,50 @@ def combine(
     return spec.with_terrain(terrain)
 
 
-def _type(title: str, character: characters.CharacterSpec) -> TaskType:
-    """Returns the task type of a title for a character."""
-    errors.check_known('task', TITLES, title)
-    types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == title}
-    type_ = types.get(character.spatial) or next(iter(types.values()))
-    _check_dimensions(type_, character)
-    return type_
-
-
-def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> None:
-    """Checks that task type and character are both planar or both three-dimensional."""
-    if character.spatial != type_.spatial:
+def _type(task: Any, character: characters.CharacterSpec) -> TaskType | None:
+    """Returns the task type of a title, or a custom one; None for a function that makes a task."""
+    if isinstance(task, str):
+        errors.check_known('task', TITLES, task)
+        types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == task}
+        task = types.get(character.spatial) or next(iter(types.values()))
+    if not isinstance(task, TaskType):
+        if not callable(task):
+            raise TypeError(
+                f'task is {task!r}; expected a title, a TaskType, or a class or function'
+            )
+        return None
+    if character.spatial != task.spatial:
         raise ValueError(
             f'character {character.name!r} is {DIMENSIONS[character.spatial]}; the task '
-            f'{type_.title!r} is for {DIMENSIONS[type_.spatial]} characters'
+            f'{task.title!r} is for {DIMENSIONS[task.spatial]} characters'
         )
+    return task
 
 
 def _actuation(type_: TaskType | None, actuation: str | None) -> str:
     """Returns the checked actuation model; by default 'position', if the task type allows it."""
-    known = actuation_models.ACTUATIONS
-    if type_ is not None and type_.actuations is not None:
-        known = type_.actuations
+    own = None if type_ is None else type_.actuations
+    known = own or actuation_models.ACTUATIONS
     if actuation is None:
         return 'position' if 'position' in known else known[0]
-    if actuation not in known:
-        owner = 'actuation' if type_ is None else f'actuation of the task {type_.title!r}'
-        raise ValueError(errors.unknown(owner, actuation, known))
+    owner = 'actuation' if type_ is None else f'actuation of the task {type_.title!r}'
+    errors.check_known(owner, known, actuation)
     return actuation
 
 
 def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
     """Returns the name of a character's default clip, or of its library of steps."""
-    name = character.name
-    if kind is motion.Clip:
-        if character.clip is None:
-            raise ValueError(
-                f"character {name!r} has no clip of its own; pass clip=, or task='walk', which needs none"
-            )
+    name, steps = character.name, motion.steps_names()
+    if kind is motion.Clip and character.clip is not None:
         return character.clip
-    known = motion.steps_names()
-    if name not in known:
+    if kind is motion.Clip:
+        raise ValueError(
+            f"character {name!r} has no clip of its own; pass clip=, or task='walk', which needs none"
+        )
+    if name not in steps:
         raise ValueError(
             f'character {name!r} has no library of steps of its own; pass clip=, one of '
-            f'{", ".join(known)}'
+            f'{", ".join(steps)}'
         )
     return name
 
@@ -260,17 +249,15 @@ def build_environment(
     environment_kwargs: Mapping[str, Any] | None,
 ) -> Environment:
     """Builds an environment from its spec; see `load` for the other arguments."""
-    task_kwargs = arguments.absolute(errors.options('task_kwargs', task_kwargs))
+    task_kwargs = errors.options('task_kwargs', task_kwargs)
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation', 'visualize_reward']
     errors.check_known('option of an environment', known, *environment_kwargs)
     options = {'step_limit': spec.step_limit, **environment_kwargs}
+    of_task = task_kwargs.copy()
     for name in _ENVIRONMENT_OPTIONS:
-        if name in task_kwargs:
-            options[name] = task_kwargs[name]
-    task = build_task(
-        spec, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
-    )
-    environment = Environment(task, **options)
+        if name in of_task:
+            options[name] = of_task.pop(name)
+    environment = Environment(build_task(spec, of_task), **options)
     environment.recipe = (build_environment, (spec, task_kwargs, environment_kwargs))
     return environment

@@ -11,7 +11,7 @@ from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
 from trl_suite.bodies.blocks import Block
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.tasks.variation import CommonOptions, additions, pushes, sensors, worlds
+from trl_suite.tasks.variation import CommonOptions, pushes, sensors, worlds
 from trl_suite.util.options import Config, Range
 from trl_suite.util.tables import Section, Table, section
 
@@ -25,7 +25,6 @@ def options(spec: EnvSpec) -> Section:
             for name, (default, data) in sorted(task_options(spec).items())
             if data['actuation'] in (None, spec.actuation)
         ),
-        (', '.join(additions.OPTIONS), '-', '', 'custom functions; see docs/make_your_own.md'),
         *((each.name, '-', '', each.metadata['meaning']) for each in common),
         ('random', '-', '', 'seed; by default drawn from the operating system'),
         ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
-from typing import Any
+import contextlib
+from collections.abc import Sequence
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 Ids = np.ndarray | Sequence[int] | None  # indices of simulations, or a mask; None for all
 
 
-def absolute(value: Any) -> Any:
-    """Returns options whose files have absolute paths: copies may be made in other folders."""
-    if isinstance(value, str) and value.endswith(('.npz', '.json')):
-        return os.path.abspath(value)
-    if isinstance(value, Mapping):
-        return {name: absolute(each) for name, each in value.items()}
-    return value
-
-
-def check_time_limit(value: Any) -> float:
-    """Returns a limit of simulated time in s; infinity for no limit.
+def limits(step_limit: Any, time_limit: Any) -> tuple[int | None, float]:
+    """Returns limits in control steps and in s; None and infinity for none.
 
     Raises:
-      ValueError: it is not a positive number.
+      ValueError: one that is not a positive number.
     """
-    if not (errors.is_number(value) and value > 0):
+    if not (errors.is_number(time_limit) and time_limit > 0):
         raise ValueError(
-            f'time_limit is {value!r}; expected a positive number of seconds, inf for no limit'
+            f'time_limit is {time_limit!r}; expected a positive number of seconds, inf for no limit'
         )
-    return value
+    return checked('step_limit', step_limit, int | None, at_least=1), time_limit
 
 
 def check_dtype(dtype: Any) -> np.dtype:
@@ -41,13 +33,10 @@ def check_dtype(dtype: Any) -> np.dtype:
     Raises:
       ValueError: it is neither float64 nor float32.
     """
-    try:
-        found = np.dtype(dtype)
-    except TypeError:
-        found = np.dtype(object)
-    if found not in (np.dtype(np.float64), np.dtype(np.float32)):
-        raise ValueError(f'dtype is {dtype!r}; expected float64 or float32')
-    return found
+    with contextlib.suppress(TypeError):
+        if np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.float32)):
+            return np.dtype(dtype)
+    raise ValueError(f'dtype is {dtype!r}; expected float64 or float32')
 
 
 def given_ids(env_ids: Ids, num_envs: int) -> list[int]:
@@ -61,9 +50,7 @@ def given_ids(env_ids: Ids, num_envs: int) -> list[int]:
       TypeError: they are neither integers nor a mask.
       ValueError: there are no such simulations, or a mask has another shape.
     """
-    if env_ids is None:
-        return list(range(num_envs))
-    ids = np.atleast_1d(np.asarray(env_ids))
+    ids = np.atleast_1d(np.arange(num_envs) if env_ids is None else np.asarray(env_ids))
     if ids.dtype == bool:
         if ids.shape != (num_envs,):
             raise ValueError(f'mask has shape {ids.shape}; expected ({num_envs},)')
@@ -85,14 +72,14 @@ def unique_ids(env_ids: Ids, num_envs: int) -> np.ndarray:
     return np.unique(np.array(given_ids(env_ids, num_envs), int))
 
 
-def check_seed(name: str, seed: Any) -> None:
-    """Checks the seed of one random stream.
+def is_integer(seed: Any) -> TypeGuard[int]:
+    """Whether a value is an integer, and no bool."""
+    return isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
 
-    Raises:
-      TypeError: it is no integer.
-      ValueError: it is not in [0, 2**32).
-    """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+
+def check_seed(name: str, seed: Any) -> None:
+    """Checks the seed of one random stream: raises a TypeError or ValueError."""
+    if not is_integer(seed):
         raise TypeError(f'{name} is {seed!r}; expected a seed, an integer in [0, 2**32)')
     if not 0 <= seed < 2**32:
         raise ValueError(f'{name} is {seed}; expected a seed in [0, 2**32)')
@@ -110,14 +97,12 @@ def all_seeds(seed: int | Sequence[int] | None, num_envs: int) -> np.ndarray:
       TypeError: a seed that is not an integer.
       ValueError: a negative seed, a wrong number of seeds, or one that is no integer in [0, 2**32).
     """
-    if seed is None or isinstance(seed, str) or not np.iterable(seed):
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
-            raise TypeError(
-                f'seed is {seed!r}; expected an integer, one for each simulation, or None'
-            )
+    if seed is None or is_integer(seed):
         if seed is not None and seed < 0:
             raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
         return np.random.SeedSequence(seed).generate_state(num_envs, np.uint32)
+    if isinstance(seed, str) or not np.iterable(seed):
+        raise TypeError(f'seed is {seed!r}; expected an integer, one for each simulation, or None')
     try:
         seeds = np.asarray(seed)
     except ValueError:  # lists of different lengths

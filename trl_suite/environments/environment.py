@@ -246,7 +246,7 @@ class Environment(composer.Environment):
             `visualize_reward` that is no bool, or substep hooks.
           TypeError: a seed that is not an integer.
         """
-        self.step_limit = checked('step_limit', step_limit, int | None, at_least=1)
+        self.step_limit, time_limit = arguments.limits(step_limit, time_limit)
         if isinstance(random, (int, float, str, bytes, np.random.Generator)):
             arguments.check_seed('random', random)
         checked('flat_observation', flat_observation, bool)
@@ -256,7 +256,7 @@ class Environment(composer.Environment):
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
-            time_limit=arguments.check_time_limit(time_limit),
+            time_limit=time_limit,
             random_state=random,
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
@@ -330,27 +330,24 @@ class Environment(composer.Environment):
           RuntimeError: after `close`, or while another thread uses the environment.
         """
         with self.core as core:
-            action = self.action_map.checked(action)
-            return self.reset() if core.ended[0] else self._advance(core, action)
-
-    def _advance(self, core: Core, action: np.ndarray) -> dm_env.TimeStep:
-        """Takes one action within an episode."""
-        task, physics = core.task, self._physics_proxy
-        if self._has_own_observables:
-            self._observation_updater.prepare_for_next_control_step()
-        if self._hooked:
-            self._hooks.before_step(physics, action, self._random_state)
-            task.simulate(core.world.all_ids)
-            self._hooks.after_step(physics, self._random_state)
-        else:
-            task.advance(action[None], core.world.all_ids)
-        self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
-        if self._has_own_observables:
-            self._observation_updater.update()
-        reward, failed = float(task.seen.reward[0]), bool(task.seen.failed[0])
-        self._show_reward(reward)
-        step_type = dm_env.StepType.LAST if core.ended[0] else dm_env.StepType.MID
-        return dm_env.TimeStep(step_type, reward, float(not failed), self._observe())
+            action, task, physics = self.action_map.checked(action), core.task, self._physics_proxy
+            if core.ended[0]:
+                return self.reset()
+            if self._has_own_observables:
+                self._observation_updater.prepare_for_next_control_step()
+            if self._hooked:
+                self._hooks.before_step(physics, action, self._random_state)
+                task.simulate(core.world.all_ids)
+                self._hooks.after_step(physics, self._random_state)
+            else:
+                task.advance(action[None], core.world.all_ids)
+            self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
+            if self._has_own_observables:
+                self._observation_updater.update()
+            reward, failed = float(task.seen.reward[0]), bool(task.seen.failed[0])
+            self._show_reward(reward)
+            step_type = dm_env.StepType.LAST if core.ended[0] else dm_env.StepType.MID
+            return dm_env.TimeStep(step_type, reward, float(not failed), self._observe())
 
     def _show_reward(self, reward: float) -> None:
         if self._colours is not None:
@@ -430,11 +427,7 @@ class Environment(composer.Environment):
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the same actions then give bit-identical results.
 
-        Raises:
-          TypeError: the state is not a dict.
-          ValueError: the state belongs to an environment with other contents, such as another
-            ground, or was changed after `get_state`; this environment is unchanged.
-          RuntimeError: after `close`, or while another thread uses the environment.
+        Errors are those of `VectorEnvironment.set_state`.
         """
         with self.core as core:
             core.set_state(state)

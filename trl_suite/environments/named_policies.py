@@ -11,8 +11,6 @@ from trl_suite.registry import catalogue
 from trl_suite.util import errors
 
 if TYPE_CHECKING:
-    import dm_env
-
     from trl_suite.environments.environment import Environment
     from trl_suite.rendering import Policy
 
@@ -58,6 +56,7 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
       ValueError: the environment has no such policy, or the policy is incompatible with it.
       FileNotFoundError: there is no such file, or no reference is shipped.
     """
+    task: Any = environment.task
     size = len(environment.action_map)
     if name == 'zero':
         return lambda time_step: np.zeros(size)
@@ -68,19 +67,14 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
         from trl_suite.tasks.navigation.scripted import scripted
 
         walk = scripted(environment)
-
-        def act(time_step: dm_env.TimeStep) -> np.ndarray:
-            return walk(np.concatenate(list(time_step.observation.values()))[None])[0]
-
-        return act
-    if name != 'clip':
-        network = trained(check(name), id)
-        network.check(environment)
-        return lambda time_step: network(time_step.observation)
-    task: Any = environment.task
-    if not hasattr(task, 'clip_action'):
-        raise ValueError(f'{id} has no clip to follow')
-    return lambda time_step: np.clip(task.clip_action(0), -1, 1)
+        return lambda time_step: walk(np.concatenate([*time_step.observation.values()])[None])[0]
+    if name == 'clip':
+        if not hasattr(task, 'clip_action'):
+            raise ValueError(f'{id} has no clip to follow')
+        return lambda time_step: np.clip(task.clip_action(0), -1, 1)
+    network = trained(check(name), id)
+    network.check(environment)
+    return lambda time_step: network(time_step.observation)
 
 
 def available(environment: Environment, id: str, seed: int = 0) -> dict[str, Policy]:

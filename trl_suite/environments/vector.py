@@ -10,6 +10,7 @@ any number of simulations and threads, and whenever other simulations are reset.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -114,14 +115,14 @@ class VectorEnvironment:
         self.spec, self.dtype = spec_of(environment), arguments.check_dtype(dtype)
         self.num_envs, self.autoreset = int(num_envs), autoreset
         self.flat_observation = flat_observation
-        self._task_kwargs = options = arguments.absolute(errors.options('task_kwargs', task_kwargs))
+        self._task_kwargs = options = errors.options('task_kwargs', task_kwargs)
         if 'random' in options:
             raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
         if isinstance(step_limit, int) and step_limit == -1:
             step_limit = self.spec.step_limit
-        step_limit = options.pop('step_limit', step_limit)
-        self.step_limit = checked('step_limit', step_limit, int | None, at_least=1)
-        self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
+        self.step_limit, self.time_limit = arguments.limits(
+            options.pop('step_limit', step_limit), options.pop('time_limit', math.inf)
+        )
         task = build_task(self.spec, options)
         model = light_model(task.root_entity.mjcf_model)
         task.attach(BatchWorld(model, self.num_envs, int(num_threads), task.fields))

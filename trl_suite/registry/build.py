@@ -70,32 +70,31 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
     Args:
       spec: spec of the environment.
-      options: options of the task, which override those of the spec; in addition, every task has
-        the options `rewards`, `observations`, `failures`, `actuators`, `randomize` and `sensors`, see
-        `trl_suite.tasks.variation`.
+      options: options of the task, which override those of the spec, and of every task, see
+        `trl_suite.tasks.variation.CommonOptions`.
 
     Raises:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
         parts that are incompatible.
     """
     notices.compiling.about(spec.id)
-    merged = {**spec.options, **(options or {})}
-    extras = {name: merged.pop(name) for name in variation.ADDITIONS if name in merged}
-    names = [each.name for each in dataclasses.fields(variation.CommonOptions)]
-    given = {name: merged.pop(name) for name in names if name in merged}
-    common = variation.CommonOptions.parse(spec.id, given)
+    given = {**spec.options, **(options or {})}
+    names, shared = [each.name for each in dataclasses.fields(variation.CommonOptions)], {}
+    for name in names:
+        if name in given:
+            shared[name] = given.pop(name)
+    common = variation.CommonOptions.parse(spec.id, shared)
     realism.check(common.actuators, spec.actuation)
-    type_, others = task_type(spec), (*variation.ADDITIONS, *names, 'random')
-    config_type, config = config_of(spec), None
+    type_, config_type, others = task_type(spec), config_of(spec), (*names, 'random')
     if config_type is None:
-        known = task_options(spec)
-        if not known.keys() >= merged.keys():
-            errors.check_known(f'option of {spec.id}', [*known, *others], *merged)
+        known, config = task_options(spec), None
+        if not known.keys() >= given.keys():
+            errors.check_known(f'option of {spec.id}', [*known, *others], *given)
     else:
         for each in dataclasses.fields(config_type):
             if each.metadata['policy']:
-                merged[each.name] = _policy(each.name, merged.get(each.name, each.default))
-        config = config_type.parse(spec.id, merged, others)
+                given[each.name] = _policy(each.name, given.get(each.name, each.default))
+        config = config_type.parse(spec.id, given, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
@@ -105,13 +104,13 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     if type_ is not None:
         task = type_.make(parts, config)
     else:
-        own: dict[str, Any] = merged if config is None else {'config': config}
+        own: dict[str, Any] = given if config is None else {'config': config}
         if spec.clip is not None:
             own['clip'] = parts.motion
         task = spec.own['task_type'](
             parts.character, parts.arena, actuation_model=parts.actuation, **own
         )
-    for component in variation.components(extras, common, parts.character):
+    for component in variation.components(common, parts.character):
         task.add(component)
     return task
 
@@ -145,11 +144,13 @@ def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators) -> Parts
 
 def _motion(spec: EnvSpec, kind: type) -> Any:
     """Returns the clip or the library of steps of an environment."""
-    given = spec.part('clip')
-    if kind is motion.FootstepLibrary:
-        if isinstance(given, motion.Clip):
-            raise ValueError(f'{given.name!r} is a clip; for footsteps, give a library of steps')
-        return given if isinstance(given, motion.FootstepLibrary) else motion.load_steps(given)
-    if isinstance(given, motion.FootstepLibrary):
-        raise ValueError(f'{given.name!r} is a library of steps; to be imitated, give a clip')
-    return given if isinstance(given, motion.Clip) else motion.load(given)
+    given, steps = spec.part('clip'), kind is motion.FootstepLibrary
+    if isinstance(given, str):
+        return motion.load_steps(given) if steps else motion.load(given)
+    if not isinstance(given, kind):
+        raise ValueError(
+            f'{given.name!r} is a clip; for footsteps, give a library of steps'
+            if steps
+            else f'{given.name!r} is a library of steps; to be imitated, give a clip'
+        )
+    return given

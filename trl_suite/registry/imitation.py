@@ -65,11 +65,6 @@ _SPATIAL_TERRAINS = (
 )
 
 
-_CLIPS = {
-    'biped3d_walk': "the clip was made for this suite, 1.2 m/s; the original's walks at 1.535 m/s"
-}
-
-
 def _spatial(
     name: str, preset: str, words: str, original: bool, clip: str = 'biped3d_walk', **options: Any
 ) -> EnvSpec:
@@ -86,10 +81,9 @@ def _spatial(
         terrain=preset,
         task_type='spatial_imitation',
         differences=(
-            _CLIPS.get(
-                clip,
-                "the clip was made for this suite, with gait and speed close to the original's",
-            ),
+            "the clip was made for this suite, 1.2 m/s; the original's walks at 1.535 m/s"
+            if gait == 'walk'
+            else "the clip was made for this suite, with gait and speed close to the original's",
         ),
         clip=clip,
         options=options,

@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import math
 import numbers
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -104,7 +105,16 @@ def floats(
 
 
 def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Returns a copy of a mapping of options; an empty dict for None. `name` is the argument's."""
+    """Returns a copy of a mapping of options; an empty dict for None. `name` is the argument's.
+
+    Paths of files become absolute, since copies may be made in other folders.
+    """
     if value is not None and not isinstance(value, Mapping):
         raise TypeError(f'{name} is {value!r}; expected a dict of options by name')
-    return dict(value or {})
+    found = dict(value or {})
+    for key, each in found.items():
+        if isinstance(each, Mapping):
+            found[key] = options(key, each)
+        elif isinstance(each, str) and each.endswith(('.npz', '.json')):
+            found[key] = os.path.abspath(each)
+    return found

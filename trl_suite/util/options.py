@@ -108,9 +108,8 @@ class Config:
         for field in dataclasses.fields(self):
             name, data = field.name, field.metadata
             limits = data['unit'], data['choices']
-            self._set(
-                name, checked(name, getattr(self, name), kinds[name], *limits, **data['bounds'])
-            )
+            found = checked(name, getattr(self, name), kinds[name], *limits, **data['bounds'])
+            object.__setattr__(self, name, found)
 
     @classmethod
     def parse(cls, owner: str, given: Any, others: Iterable[str] = ()) -> Self:
@@ -181,9 +180,10 @@ def checked(
     kinds = typing.get_args(kind) if union else (kind,)
     if value is None and types.NoneType in kinds:
         return None
-    found: Any
-    forms = (_normal(name, value, each) for each in kinds)
-    found = next((form for form in forms if form is not _UNFIT), _UNFIT)
+    found: Any = _UNFIT
+    for each in kinds:
+        if found is _UNFIT:
+            found = _normal(name, value, each)
     if found is not _UNFIT and choices:
         errors.check_known(name, choices, *((found,) if isinstance(found, str) else found))
     if found is _UNFIT or (bounds and not _is_within(found, bounds)):

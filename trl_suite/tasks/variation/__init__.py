@@ -27,13 +27,16 @@ from trl_suite.tasks.variation.sensors import SensorConfig, Sensors
 from trl_suite.tasks.variation.worlds import WorldConfig, Worlds
 from trl_suite.util.options import Config, option
 
-ADDITIONS = additions.OPTIONS
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CommonOptions(Config):
-    """Options of every task, in addition to its own and to `ADDITIONS`."""
+    """Options of every task, in addition to its own."""
 
+    rewards: Any = option(
+        None, 'custom terms: name -> (weight, function); see docs/make_your_own.md'
+    )
+    observations: Any = option(None, 'custom blocks: name -> (size, function)')
+    failures: Any = option(None, 'custom failures: name -> function')
     randomize: WorldConfig | None = option(
         None,
         "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a "
@@ -64,25 +67,20 @@ class CommonOptions(Config):
         level.check(self.levels)
 
 
-def components(
-    added: Mapping[str, Any], options: CommonOptions, character: Character
-) -> Iterator[Component]:
+def components(options: CommonOptions, character: Character) -> Iterator[Component]:
     """Yields the components that options ask for, in the order in which a task has them.
 
-    Args:
-      added: values of `ADDITIONS`.
-      options: the other options.
-      character: the character whose joints the motors drive.
-
     Raises:
-      ValueError: invalid additions, or options that do not suit the character.
+      ValueError: invalid additions, or options that do not suit the character, whose joints motors
+        drive.
     """
     if options.levels is not None:
         yield level.Levels(options.levels)
     if options.actuators.changed:
         yield Motors(options.actuators, character)
+    added = {name: getattr(options, name) for name in additions.OPTIONS}
     if any(added.values()):
-        yield additions.additions(added)
+        yield additions.additions({name: each for name, each in added.items() if each})
     if options.randomize is not None:
         yield Worlds(options.randomize)
         if options.randomize.push is not None:
