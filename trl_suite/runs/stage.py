@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.environments import arguments
+from trl_suite.environments.arguments import Ids, unique_ids
 from trl_suite.environments.vector import Step, VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.registry.spec import EnvSpec
@@ -134,11 +134,9 @@ class _Counted(VectorEnvironment):
         self._sums = np.zeros(num_envs)
         super().__init__(spec, num_envs, **options)
 
-    def step(self, action: np.ndarray, env_ids: np.ndarray | Numbers[int] | None = None) -> Step:
-        count = (
-            self.num_envs if env_ids is None else len(arguments.unique_ids(env_ids, self.num_envs))
-        )
-        self._stage.spend(self._number, count)
+    def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
+        asked = self.num_envs if env_ids is None else len(unique_ids(env_ids, self.num_envs))
+        self._stage.spend(self._number, asked)
         step = super().step(action, env_ids)
         self._sums += step.reward
         ended = step.terminated | step.truncated
@@ -147,21 +145,12 @@ class _Counted(VectorEnvironment):
             self._sums[ended] = 0
         return step
 
-    def reset(
-        self,
-        env_ids: np.ndarray | Numbers[int] | None = None,
-        seed: int | Numbers[int] | None = None,
-        level: int | Numbers[int] | None = None,
-    ) -> Any:
+    def reset(self, env_ids: Ids = None, seed: Any = None, level: Any = None) -> Any:
         observation = super().reset(env_ids, seed, level)
-        self._sums[arguments.unique_ids(env_ids, self.num_envs)] = 0
+        self._sums[unique_ids(env_ids, self.num_envs)] = 0
         return observation
 
-    def seed(
-        self,
-        seed: int | Numbers[int] | None,
-        env_ids: np.ndarray | Numbers[int] | None = None,
-    ) -> None:
+    def seed(self, seed: int | Numbers[int] | None, env_ids: Ids = None) -> None:
         """Reseeds as `VectorEnvironment.seed`; one seed for all gives `train_seeds`.
 
         Raises:
