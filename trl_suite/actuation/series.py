@@ -49,30 +49,22 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
         contact = ElementTree.SubElement(tree, 'contact')
     for body in [*tree.iter('body')]:
         joints = [each for each in body.findall('joint') if each.get('name') in spec.joints]
+        names = [each.get('name', '') for each in joints]
         if len(joints) > 1:
-            name = 'backlash' if backlash else 'flex'
             raise ValueError(
-                f'{name} needs one joint for each link; {spec.name!r} has the joints '
-                f'{", ".join(str(joint.get("name")) for joint in joints)} on the same link'
+                f'{"backlash" if backlash else "flex"} needs one joint for each link; {spec.name!r} has '
+                f'the joints {", ".join(names)} on the same link'
             )
         if joints:
-            limit = limits[joints[0].get('name', '')]
-            _divide(body, joints[0], limit, backlash, flex, damping)
-    # A link does not collide with the link to which its motor is attached, as before.
-    for above, below in _neighbours(spec, character):
-        ElementTree.SubElement(contact, 'exclude', body1=above, body2=below)
+            _divide(body, joints[0], limits[names[0]], backlash, flex, damping)
+    # A link does not collide with the link to which its motor is attached, as without a motor.
+    for joint in character.joints:
+        link, above = joint.parent, joint.parent.parent
+        if above.tag == 'body':
+            ElementTree.SubElement(contact, 'exclude', body1=above.name, body2=link.name)
     changed = dataclasses.replace(spec, xml=ElementTree.tostring(tree, encoding='unicode'))
     vars(changed)['digest'] = spec.digest  # it is the same character for policies
     return changed
-
-
-def _neighbours(spec: CharacterSpec, character: Character) -> list[tuple[str, str]]:
-    """Returns the names of the bodies that each driven joint connects."""
-    return [
-        (joint.parent.parent.name, joint.parent.name)
-        for joint in character.joints
-        if joint.parent.parent.tag == 'body'
-    ]
 
 
 def _divide(
