@@ -309,7 +309,7 @@ class PlainComposerTest(parameterized.TestCase):
         ('PD_Biped3D_HLC_Soccer-v0', {}, f'{OURS}, not.*composer'),
         ('PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}, f'{OURS}, not.*composer'),
         ('PD_Biped3D_HLC_Soccer-v0', {'rewards': {'idle': (0.1, lambda task: np.zeros(task.world.n))}}, OURS),
-        ('FSM_Dog2D_Terrain_Slopes_Mixed-v0', {}, OURS), (GAPS, {'randomize': 'mild'}, 'no pushes'),
+        ('FSM_Dog2D_Terrain_Slopes_Mixed-v0', {}, OURS), (GAPS, {'randomize': 'mild'}, 'pushes need'),
         (GAPS, {'actuators': {'noise': 0.1}}, 'not a plain composer.Environment'),
     )  # fmt: skip
     def test_it_is_rejected(self, id_, options, message):

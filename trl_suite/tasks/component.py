@@ -32,11 +32,14 @@ class Component:
       blocks: observation blocks that follow those of the task.
       saved: state: tuples of arrays (n, ...).
       info_arrays: further results, see `Task.info_arrays`.
+      by_engine: what needs the engine's physics steps, so that a plain composer.Environment cannot run
+        the task.
       in_parts: whether several threads may call the hooks, each for some simulations.
     """
 
     blocks: tuple[Block, ...] = ()
     saved: tuple[NamedTuple, ...] = ()
+    by_engine = ''
     in_parts = True
 
     def added_to(self, task: Task) -> None:

@@ -345,12 +345,22 @@ class Task(composer.Task):
             # A plain composer.Environment leaves actuator velocities of zero after a reset.
             self.world.forward(self.world.all_ids)
             self._begun = False
+        self._stepped = int(self.world.engine.steps[0])
         given = self.action_map.checked(action)[None]
         for component in self.components:
             component.before_physics(given, self.world.all_ids)
         self.apply_action(given, self.world.all_ids)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        if self.world.engine.steps[0] == self._stepped:  # composer has advanced the physics itself
+            needs = [component.by_engine for component in self.components]
+            if type(self).simulate is not Task.simulate:
+                needs.append('the steps of this task')
+            if any(needs):
+                raise RuntimeError(
+                    f'{next(filter(None, needs))} need trl_suite.environments.environment.Environment, '
+                    'not a plain composer.Environment'
+                )
         self.finish_step(self.world.all_ids)
         for component in self.components:
             component.finish(self.world.all_ids, False)
@@ -404,22 +414,6 @@ def _restore(saved: Sequence[NamedTuple], env_id: int, state: list[list[np.ndarr
     for group, values in zip(saved, state, strict=True):
         for array, value in zip(group, values, strict=True):
             array[env_id] = value
-
-
-def check_simulated(lasted: np.ndarray) -> None:
-    """Checks that `simulate` of a task with steps of variable duration was called.
-
-    Args:
-      lasted: duration of the step of each simulation; 0 if `simulate` was not called.
-
-    Raises:
-      RuntimeError: it was not called for some simulations.
-    """
-    if not lasted.all():
-        raise RuntimeError(
-            'the steps of this task have a variable duration: use '
-            'trl_suite.environments.environment.Environment, not a plain composer.Environment'
-        )
 
 
 def random_displacement(random: np.random.Generator, low: float, high: float) -> np.ndarray:

@@ -26,7 +26,7 @@ from trl_suite.engine import World
 from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, flat_ground
 from trl_suite.tasks.gait import rules
 from trl_suite.tasks.rewards import terms_data
-from trl_suite.tasks.task import Task, check_simulated
+from trl_suite.tasks.task import Task
 from trl_suite.terrain import PlanarGround
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
@@ -244,7 +244,6 @@ class GaitTask(Task):
                 self.watch()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        check_simulated(self.state.lasted[env_ids])
         rules.finish_steps(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:

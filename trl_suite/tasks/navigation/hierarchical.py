@@ -44,7 +44,7 @@ from trl_suite.tasks.common.goals import (
 )
 from trl_suite.tasks.navigation import hierarchical_rules as rules
 from trl_suite.tasks.rewards import terms_data
-from trl_suite.tasks.task import Marker, check_simulated, drawn_seed
+from trl_suite.tasks.task import Marker, drawn_seed
 from trl_suite.util.options import Range, option
 
 INTERFACES = ('plan', 'frame')
@@ -301,7 +301,6 @@ class HierarchicalNavigation(Planned, GoalTask):
         return self._controller_observation.copy()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        check_simulated(self.state.lasted[env_ids])
         if rules.score_all(env_ids, self._pack):
             self._redraw_goals(env_ids)
         rules.finish_all(env_ids, self._pack)

@@ -26,6 +26,8 @@ class Motors(Component):
       actuators: the options.
     """
 
+    by_engine = 'motors that are not ideal'
+
     def __init__(self, actuators: Actuators, character: Character) -> None:
         """Keeps the options; the character is made from what `realism.body` returns.
 
@@ -64,7 +66,7 @@ class Motors(Component):
             for each in world.models:  # only the motors' limits count
                 each.jnt_actfrclimited[units.joints] = False
                 each.actuator_forcelimited[np.concatenate(units.actuators)] = True
-        self._delay, self._age = np.zeros(world.n), np.zeros(world.n)
+        self._delay = np.zeros(world.n)
         self._info: dict[str, np.ndarray] = {}
         if 'strength' in actuators.changed:
             for name, strength in zip(units.names, self.motors.strength.T, strict=True):
@@ -103,16 +105,6 @@ class Motors(Component):
         state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
         seeded(env_id, own.spawn(1)[0], self.motors.stream)
         self.restored(env_id)
-
-    def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        self._age[env_ids] = self.motors.age[env_ids]
-
-    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if not fresh and (self.motors.age[env_ids] == self._age[env_ids]).any():
-            raise RuntimeError(
-                'the motors of this task are updated before every physics step: use '
-                'trl_suite.environments.environment.Environment, not a plain composer.Environment'
-            )
 
     def restored(self, env_id: int) -> None:
         self._delay[env_id] = 1000 * self._timestep * self.motors.lag[env_id]

@@ -59,6 +59,8 @@ class Pushes(Component):
     has 'impulse', that of the last step, (n, 3) N s.
     """
 
+    by_engine = 'pushes'
+
     def __init__(self, config: PushConfig) -> None:
         self._config = config
 
@@ -83,7 +85,7 @@ class Pushes(Component):
         pushes.ranges[k, DIRECTION], pushes.planar[k] = push.direction, not spec.spatial
         pushes.mass[k] = world.models[0].body_mass[links].sum() if push.force is None else 0.0
         pushes.body[k] = links[0 if push.body is None else spec.links.index(push.body)]
-        self._pushes, self._steps = pushes, np.zeros(world.n, int)
+        self._pushes = pushes
         if not k:
             self.saved = (pushes.state,)
             self.info_arrays = {'impulse': pushes.state.impulse}
@@ -98,14 +100,6 @@ class Pushes(Component):
 
     def before_physics(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self._pushes.state.impulse[env_ids] = 0.0
-        self._steps[env_ids] = self.task.world.engine.steps[env_ids]
-
-    def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if not fresh and (self.task.world.engine.steps[env_ids] == self._steps[env_ids]).any():
-            raise RuntimeError(
-                'a plain composer.Environment has no pushes: use '
-                'trl_suite.environments.environment.Environment'
-            )
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns an arrow for a push."""

@@ -119,37 +119,6 @@ class WorldConfig(Config):
         return tuple(name for name in Properties._fields if getattr(self, name) is not None)
 
 
-def draw(
-    env_id: int,
-    config: WorldConfig,
-    random: np.random.Generator,
-    spatial: bool,
-    properties: Properties,
-) -> None:
-    """Draws the properties of one simulation.
-
-    A number is drawn for every property, in a fixed order, whether it is varied or not, so that the
-    draws of one do not depend on which others are varied.
-
-    Args:
-      env_id: index of the simulation.
-      config: the options.
-      random: the random numbers.
-      spatial: whether the character is three-dimensional.
-      properties: written in place.
-    """
-    for name in Properties._fields:
-        array = getattr(properties, name)
-        share: Any = random.random(array.shape[1:] or None)
-        given = getattr(config, name)
-        if name == 'com_offset':
-            if given is not None:
-                size = given.low + (given.high - given.low) * share[0]
-                array[env_id] = size * direction(share[1], share[2], spatial)
-        elif given is not None:
-            array[env_id] = given.low + (given.high - given.low) * share
-
-
 def direction(first: float, second: float, spatial: bool) -> np.ndarray:
     """Returns a unit vector, uniform on the sphere, or on the circle of x and z, from two draws."""
     angle = 2 * np.pi * first
@@ -175,7 +144,17 @@ class Worlds(Component):
         self._config = config
 
     def added_to(self, task: Task) -> None:
-        _check(task, self._config)
+        if not hasattr(task, 'figure') or not hasattr(task, 'character'):
+            raise ValueError(
+                f'randomize: the task {type(task).__name__} has no attributes `character` and `figure`, '
+                'as all tasks of the suite do'
+            )
+        self._spatial = task.character.spec.spatial
+        if self._config.slope_direction is not None and not self._spatial:
+            raise ValueError(
+                'slope_direction is for three-dimensional characters; planar ones move along x, so '
+                'that slope alone, positive or negative, is enough'
+            )
         super().added_to(task)
 
     @property
@@ -184,41 +163,33 @@ class Worlds(Component):
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         task: Any = self.task
-        figure, spatial = task.figure, task.character.spec.spatial
-        self._spatial = spatial
+        figure, varied = task.figure, self._config.varied
         constants = getattr(task.root_entity, 'set_inertia', None)
-        dofs = figure.pose_dof[6 if spatial else 3 :]
-        self.variation = Variation(world, self._config.varied, figure.links, dofs, constants)
+        dofs = figure.pose_dof[6 if self._spatial else 3 :]
+        self.variation = Variation(world, varied, figure.links, dofs, constants)
         properties = self.variation.properties
         self.saved = (properties,)
-        self.info_arrays = {
-            'world': {name: getattr(properties, name) for name in self._config.varied}
-        }
+        self.info_arrays = {'world': {name: getattr(properties, name) for name in varied}}
         return outcome
 
     def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
+        """Draws the properties of one simulation.
+
+        A number is drawn for every property, in a fixed order, whether it is varied or not, so that
+        the draws of one do not depend on which others are varied.
+        """
         random = np.random.default_rng(spawned(seed, WORLD))
-        draw(env_id, self._config, random, self._spatial, self.variation.properties)
+        for name, array in self.variation.properties._asdict().items():
+            share: Any = random.random(array.shape[1:] or None)
+            given = getattr(self._config, name)
+            if given is None:
+                continue
+            if name == 'com_offset':
+                size = given.low + (given.high - given.low) * share[0]
+                array[env_id] = size * direction(share[1], share[2], self._spatial)
+            else:
+                array[env_id] = given.low + (given.high - given.low) * share
         self.variation.apply(env_id)
 
     def restored(self, env_id: int) -> None:
         self.variation.apply(env_id)
-
-
-def _check(task: Task, world: WorldConfig) -> None:
-    """Checks that a task can have these worlds.
-
-    Raises:
-      ValueError: it cannot.
-    """
-    if not hasattr(task, 'figure') or not hasattr(task, 'character'):
-        raise ValueError(
-            f'randomize: the task {type(task).__name__} has no attributes `character` and `figure`, as '
-            'all tasks of the suite do'
-        )
-    spec = task.character.spec
-    if world.slope_direction is not None and not spec.spatial:
-        raise ValueError(
-            'slope_direction is for three-dimensional characters; planar ones move along x, so that '
-            'slope alone, positive or negative, is enough'
-        )
