@@ -108,7 +108,7 @@ class Subject:
         self.on_terrain = suite.find(id_).terrain != 'flat'
         self.model = self.environment.physics.model.ptr
         self.data = self.environment.physics.data.ptr
-        figure = self.task.figure
+        figure = self.task.body
         self.joint_qpos, self.joint_dof = figure.pose_qpos[3:], figure.pose_dof[3:]
         self.root_qpos, self.z_dof = figure.pose_qpos[:2], figure.pose_dof[1]
         body = self.model.dof_bodyid[figure.pose_dof[0]]
@@ -132,7 +132,7 @@ class Subject:
         self.environment.reset()
         if noise:
             random = np.random.default_rng([seed, 1])
-            moved = self.task.figure.pose_qpos[2:]
+            moved = self.task.body.pose_qpos[2:]
             self.data.qpos[moved] += random.normal(0, noise, len(moved))
             mujoco.mj_forward(self.model, self.data)
         if self.on_terrain:

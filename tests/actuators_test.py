@@ -493,7 +493,7 @@ class SeriesTest(parameterized.TestCase):
         plain = suite.build(character, task_kwargs={'random': 5})
         given = suite.build(character, task_kwargs={'random': 5, 'actuators': options})
         np.testing.assert_allclose(flat(plain.reset()), flat(given.reset()), atol=1e-9)
-        self.assertEqual(plain.task.figure.__class__, given.task.figure.__class__)
+        self.assertEqual(plain.task.body.__class__, given.task.body.__class__)
         before, after = (each.physics.model.ptr for each in (plain, given))
         self.assertAlmostEqual(after.body_mass.sum() / before.body_mass.sum(), 1, delta=1e-4)
         self.assertGreater(after.nexclude, before.nexclude)

@@ -107,7 +107,7 @@ class SessionTest(parameterized.TestCase):
         shown = session.Session(environment, zero(environment))
         shown.advance()
         model, data = environment.physics.model.ptr, environment.physics.data.ptr
-        root = environment.task.figure.links[0]
+        root = environment.task.body.links[0]
 
         def velocity():
             mujoco.mj_subtreeVel(model, data)
@@ -253,7 +253,7 @@ class SceneTest(parameterized.TestCase):
         environment, scene = self.shown(id_)
         scene.update()
         for x in (101.2, 207.3):
-            environment.physics.data.qpos[environment.task.figure.pose_qpos[0]] = x
+            environment.physics.data.qpos[environment.task.body.pose_qpos[0]] = x
             environment.physics.forward()
             with mock.patch.object(scene, '_lay_ground', wraps=scene._lay_ground) as lay:
                 scene.update(jump=True)
@@ -276,7 +276,7 @@ class SceneTest(parameterized.TestCase):
         task = environment.task
         samples = overlays.terrain_samples(task, environment.physics)
         self.assertLen(samples, len(observed))
-        x, y, _ = environment.physics.data.xpos[task.figure.links[0]]
+        x, y, _ = environment.physics.data.xpos[task.body.links[0]]
         at = ([[x]], [[y]]) if task.arena.terrain.spatial else ([[x]],)
         under = task.arena.height(*map(np.array, at)).item()
         np.testing.assert_allclose(samples[:, 2] - under, observed, atol=1e-9)

@@ -726,7 +726,7 @@ VALUES = (1e3, -9999.0, 999_999.0, -1e6, 1e9, -1e300, np.nan, np.inf)
 
 def extreme_states(task):
     """Yields the arrays, columns and values of extreme states."""
-    world, figure, spatial = task.world, task.figure, task.character.spec.spatial
+    world, figure, spatial = task.world, task.body, task.character.spec.spatial
     position, velocity = 7 if spatial else 3, 6 if spatial else 3  # columns of the root
     turn = figure.pose_qpos[3:7] if spatial else figure.pose_qpos[2:3]
     yield world.qpos, turn, (0, 1, 0, 0) if spatial else np.pi  # upside down

@@ -42,7 +42,7 @@ def zeros(environment):
 
 
 def links(environment):
-    return environment.task.figure.links
+    return environment.task.body.links
 
 
 def aloft(id_, height=50.0, **options):
@@ -50,7 +50,7 @@ def aloft(id_, height=50.0, **options):
     environment = made(id_, **options)
     environment.reset()
     spatial = environment.task.character.spec.spatial
-    place = environment.task.figure.pose_qpos[2 if spatial else 1]
+    place = environment.task.body.pose_qpos[2 if spatial else 1]
     environment.physics.data.qpos[place] += height
     environment.physics.forward()
     return environment
@@ -126,7 +126,7 @@ class WorldTest(parameterized.TestCase):
         for _ in range(2):
             environment.reset()
         before, after = (each.physics.model.ptr for each in (nominal, environment))
-        world, own, figure = environment.info['world'], links(environment), environment.task.figure
+        world, own, figure = environment.info['world'], links(environment), environment.task.body
         expected = before.body_mass.copy()
         expected[own] *= world['mass'] * world['link_mass']
         np.testing.assert_allclose(after.body_mass, expected, rtol=1e-14)

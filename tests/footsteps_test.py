@@ -52,7 +52,7 @@ def idle(environment):
 
 def held(environment):
     """Takes a step high in the air, where nothing falls."""
-    figure, data = environment.task.figure, environment.physics.data
+    figure, data = environment.task.body, environment.physics.data
     root = (0, 8, 0) if is_planar(environment) else (0, 0, 8, 1, 0, 0, 0)
     data.qpos[figure.pose_qpos[: len(root)]] = root
     data.qvel[figure.pose_dof] = 0
@@ -137,7 +137,7 @@ class ClockTest(parameterized.TestCase):
             self.assertLess(angle_between(ahead, heading(task)[0]), 1e-9)
             step = environment.step(idle(environment) + 0.1)
         if id_ == PLANAR:  # heading back
-            environment.physics.data.qpos[environment.task.figure.pose_qpos[2]] = np.pi
+            environment.physics.data.qpos[environment.task.body.pose_qpos[2]] = np.pi
             environment.physics.forward()
             task.observe()
             way = (task.plan.landing[0] - ankles(environment)[::-1])[:, 0]  # left, right
@@ -171,7 +171,7 @@ class ClockTest(parameterized.TestCase):
             for time in (phase - 0.04, phase, phase + 0.04):
                 pose = task.clip.pose(time * task.clip.duration)
                 put(environment, pose, np.zeros(len(pose)))
-                found.append(task.world.xpos[0, task.figure.effectors, ::2])
+                found.append(task.world.xpos[0, task.body.effectors, ::2])
             x, z = np.moveaxis(found, -1, 0)
             self.assertLess(z[:, stance].max() + 0.02, z[:, 1 - stance].min())
             self.assertLess(np.ptp(x[:, stance]), 0.25 * np.ptp(x[:, 1 - stance]))
@@ -252,7 +252,7 @@ class PlanTest(parameterized.TestCase):
 
     def test_plans_made_from_the_root(self):
         environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
-        measured = environments.task.figure.measure()
+        measured = environments.task.body.measure()
         sizes, turns = [], []
         for _, _, after, headings, stance in found:
             turns.append(headings - measured.heading)
@@ -318,7 +318,7 @@ class PlanTest(parameterized.TestCase):
             first = seen if first is None else first
             np.testing.assert_allclose(seen, first, rtol=0, atol=1e-9)
             # Forward is where it heads.
-            rate = environment.physics.data.qvel[environment.task.figure.pose_dof]
+            rate = environment.physics.data.qvel[environment.task.body.pose_dof]
             self.assertGreater(rate[:2] @ [np.cos(ahead), np.sin(ahead)], 0.5)
             self.assertGreater(np.abs(body(environment, 'xpos', 'root')[:2]).max(), 2)
             environment.task.observe()
@@ -360,7 +360,7 @@ class GoalTest(parameterized.TestCase):
         x, y, _ = body(environment, 'xpos', 'root')
         if ahead is None:  # at the middle itself, which gives no direction, and far enough to stay
             task.goal[0, :2] = places.mean(0)[:2] + 0.05
-            environment.physics.data.qpos[task.figure.pose_qpos[1]] += aside
+            environment.physics.data.qpos[task.body.pose_qpos[1]] += aside
             environment.physics.forward()
         else:
             task.goal[0, :2] = x + ahead, y + 0.3
@@ -476,8 +476,8 @@ class RewardTest(parameterized.TestCase):
     def test_the_root_and_the_centre_of_mass(self, id_):
         environment, _ = self.placed(id_, 0.1)
         task, data = environment.task, environment.physics.data
-        data.qpos[task.figure.pose_qpos[1 if id_ == PLANAR else 2]] += 0.1
-        data.qvel[task.figure.pose_dof[:2]] += (0.6, -0.8)
+        data.qpos[task.body.pose_qpos[1 if id_ == PLANAR else 2]] += 0.1
+        data.qvel[task.body.pose_dof[:2]] += (0.6, -0.8)
         environment.physics.forward()
         task.observe()
         found = task.reward_terms[0]
@@ -581,7 +581,7 @@ class LandingTest(parameterized.TestCase):
         still = np.zeros(len(environment.action_map))
         for _ in range(2):
             kept = environment.step(still).observation
-        environment.physics.data.qpos[environment.task.figure.pose_qpos[:1]] = np.nan
+        environment.physics.data.qpos[environment.task.body.pose_qpos[:1]] = np.nan
         step = environment.step(still)  # at the switch of stance
         self.assertTrue(step.last())
         info = dict(environment.info)
@@ -607,7 +607,7 @@ class StartTest(parameterized.TestCase):
         straight = int(np.flatnonzero((steps.labels == (0.5, 0.15, 0)).all(1))[0])
         for phase in (0.1, 0.6):
             environment, _ = started(start_phase=phase)
-            figure, data = environment.task.figure, environment.physics.data
+            figure, data = environment.task.body, environment.physics.data
             pose = steps.pose(straight, 0.2 * steps.duration, phase >= 0.5)
             rate = steps.velocity(straight, 0.2 * steps.duration, phase >= 0.5)
             np.testing.assert_allclose(data.qpos[figure.pose_qpos][3:], pose[3:], atol=1e-9)

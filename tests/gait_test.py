@@ -130,7 +130,7 @@ class ObservationTest(parameterized.TestCase):
         task = env_ids.task
         for env_id in range(n):
             # As far back from the middle of its boxes as they let it be.
-            task.world.qpos[env_id, task.figure.pose_qpos[:3]] = -2.9, 3.0, 2.0
+            task.world.qpos[env_id, task.body.pose_qpos[:3]] = -2.9, 3.0, 2.0
         task.world.forward(np.arange(n))
         task.observe()
         for env_id in range(n):
@@ -271,8 +271,8 @@ class Adrift:
         environment.reset()
         data = environment.physics.data
         data.qvel[:] = 0
-        data.qpos[task.figure.pose_qpos[1:3]] = 8.0, pitch
-        data.qvel[task.figure.pose_dof[:3]] = velocity
+        data.qpos[task.body.pose_qpos[1:3]] = 8.0, pitch
+        data.qvel[task.body.pose_dof[:3]] = velocity
         task.world.forward(np.zeros(1, int))
         task.state.milestone[:] = 0.0, 8.0
         self.time, self.contacts = 0, contacts

@@ -158,7 +158,7 @@ def links_on_ground(environment):
 def put(environment, pose, rate):
     """Sets the character to a pose of a clip: root and joints in link order."""
     task, data = environment.task, environment.physics.data
-    data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
+    data.qpos[task.body.pose_qpos], data.qvel[task.body.pose_dof] = pose, rate
     environment.physics.forward()
 
 

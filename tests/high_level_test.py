@@ -63,7 +63,7 @@ def turned(way, angle):
 def carry(environment, away=(0, 0, 0), yaw=0.0):
     """Moves the walker by a displacement, and rotates it about its root."""
     task, data = environment.task, environment.physics.data
-    pose = data.qpos[task.figure.pose_qpos]
+    pose = data.qpos[task.body.pose_qpos]
     pose[:3] += away
     half = 0.5 * yaw
     w, x, y, z = pose[3:7]
@@ -71,7 +71,7 @@ def carry(environment, away=(0, 0, 0), yaw=0.0):
     pose[3:7] = cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x, (
         cosine * z + sine * w
     )  # fmt: skip
-    data.qpos[task.figure.pose_qpos] = pose
+    data.qpos[task.body.pose_qpos] = pose
     environment.physics.forward()
 
 
@@ -85,7 +85,7 @@ def put_ball(environment, position, velocity=(0, 0, 0), spin=(0, 0, 0)):
 @contextlib.contextmanager
 def moved(task, walker=(0, 0), ball=None, each=None):
     """Instead of physics: the walker glides at a velocity, m/s, and so does the ball."""
-    world, pose = task.world, task.figure.pose_qpos
+    world, pose = task.world, task.body.pose_qpos
 
     def step(nstep, env_ids=None):
         env_ids = np.arange(world.n) if env_ids is None else env_ids
@@ -234,12 +234,12 @@ class FallTest(parameterized.TestCase):
         for i, touch in enumerate(samples, 1):
             share = 0.9 * share + int(touch) / 11
             self.assertEqual(share > 0.25, i == fall)  # the case is as described
-        height = environment.physics.data.qpos[task.figure.pose_qpos[2]]
+        height = environment.physics.data.qpos[task.body.pose_qpos[2]]
 
         def place():
             number = task.clock.steps[0] // 3
             touch = number < len(samples) and samples[number] == '1'
-            task.world.qpos[0, task.figure.pose_qpos[2]] = height - 1.0 if touch else 5.0
+            task.world.qpos[0, task.body.pose_qpos[2]] = height - 1.0 if touch else 5.0
 
         with moved(task, each=place):
             for _ in range(1 + len(samples) // 5):
@@ -371,7 +371,7 @@ class BallTest(parameterized.TestCase):
         specs = VectorEnvironment(SOCCER, 300, 1, seed=0)
         specs.reset()
         task = specs.task
-        root = task.world.xpos[:, task.figure.links[0], :2]
+        root = task.world.xpos[:, task.body.links[0], :2]
         ball = task.world.qpos[:, task.ball.qpos]
         away, shot = ball[:, :2] - root, task.goal[:, :2] - ball[:, :2]
         assert_uniform(np.hypot(*away.T), 0.7, 10)

@@ -278,7 +278,7 @@ class ObservationTest(parameterized.TestCase):
         # On a plane pose and velocity stay the same when everything is turned and moved.
         environment, step = started(PLANE, 5)
         task, data, before = environment.task, environment.physics.data, step.observation
-        pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+        pose, rate = data.qpos[task.body.pose_qpos], data.qvel[task.body.pose_dof]
         turned, half = np.zeros(4), heading / 2
         mujoco.mju_mulQuat(turned, np.array([np.cos(half), 0, 0, np.sin(half)]), pose[3:7])
         pose[:2], pose[3:7] = (3.0, -2.0), turned
@@ -320,7 +320,7 @@ class ObservationTest(parameterized.TestCase):
     def test_goal_is_straight_ahead(self, x, y, heading):
         environment, _ = started(PLANE)
         task, data = environment.task, environment.physics.data
-        pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+        pose, rate = data.qpos[task.body.pose_qpos], data.qvel[task.body.pose_dof]
         pose[:2] = x, y
         pose[3:7] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
         put(environment, pose, rate)
@@ -349,7 +349,7 @@ class ObservationTest(parameterized.TestCase):
             task, data = environment.task, environment.physics.data
             belt = task.arena.grounds[0].layout.belts.velocity[0]
             self.assertAlmostEqual(np.linalg.norm(belt), 0.6)
-            pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
+            pose, rate = data.qpos[task.body.pose_qpos], data.qvel[task.body.pose_dof]
             pose[:3] += 5.5 - pose[0], -pose[1], 0.01  # the strip from x = 3 to 8 m, 1 cm high
             put(environment, pose, rate)
             task.arena.recentre(np.zeros(1, int), pose[None, :2])
@@ -501,7 +501,7 @@ class ResetTest(parameterized.TestCase):
     @parameterized.parameters(*PLANAR, PLANE)
     def test_pose_and_velocity_of_the_clip(self, id_):
         environment, _ = started(id_, start_phase=0.37)
-        clip, figure = environment.task.clip, environment.task.figure
+        clip, figure = environment.task.clip, environment.task.body
         pose, rate = clip.pose(0.37 * clip.duration), clip.velocity(0.37 * clip.duration)
         data, first = environment.physics.data, 3 if id_ == PLANE else 2
         # In the plane the task interpolates a table of the clip.

@@ -154,7 +154,7 @@ class GoalTest(parameterized.TestCase):
         environments = VectorEnvironment(TRAIL, 32, seed=0)
         environments.reset()
         task = environments.task
-        way = task.goal[:, :2] - environments.task.world.xpos[:, task.figure.links[0], :2]
+        way = task.goal[:, :2] - environments.task.world.xpos[:, task.body.links[0], :2]
         self.assertLess(np.hypot(*way.T).max(), 6)  # segments are 2 m long
         np.testing.assert_allclose(task.goal[:, 2], 0, atol=1e-6)  # the path is level
 

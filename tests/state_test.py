@@ -446,7 +446,7 @@ class FarTest(parameterized.TestCase):
         idle = np.zeros((2, len(environments.action_map)))
         environments.reset()
         environments.step(idle)
-        world, figure = environments.task.world, environments.task.figure
+        world, figure = environments.task.world, environments.task.body
         state, expected = environments.get_state(), [environments.step(idle) for _ in range(4)]
         for place in map(np.atleast_1d, BEYOND[id_]):
             environments.set_state(state)
@@ -469,7 +469,7 @@ class FarTest(parameterized.TestCase):
     def test_over_the_rim_of_the_ground(self, id_, place):
         environment = helpers.made(id_, seed=3, step_limit=None)
         environment.reset()
-        data, root = environment.physics.data, environment.task.figure.pose_qpos[:3]
+        data, root = environment.physics.data, environment.task.body.pose_qpos[:3]
         data.qpos[root] = *place, data.qpos[root[2]] + 3.0
         environment.task.world.forward(environment.task.world.all_ids)
         for _ in range(300):

@@ -50,7 +50,7 @@ def observed(environment):
 
 def state(environment):
     task, data = environment.task, environment.physics.data
-    return data.qpos[task.figure.pose_qpos].copy(), data.qvel[task.figure.pose_dof].copy()
+    return data.qpos[task.body.pose_qpos].copy(), data.qvel[task.body.pose_dof].copy()
 
 
 def disturbed(environment, rng, angle=0.4):

@@ -230,7 +230,7 @@ class WindowTest(parameterized.TestCase):
         environment = suite.make(HILLS, {'random': 1})
         shown, screen = self.window(environment)
         shown._pause_subject.toggle()
-        place = environment.physics.data.xpos[environment.task.figure.links[0]]
+        place = environment.physics.data.xpos[environment.task.body.links[0]]
         marker = Marker('sphere', place, (0.5, 0.5, 0.5), (1, 0, 0, 1))
 
         def change(i):

@@ -62,7 +62,7 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
     task, limit = environments.task, environments.step_limit
     assert limit is not None
     duration = np.full(episodes, CONTROL_TIMESTEP)  # s; of a step without hierarchy
-    root = task.figure.links[0]
+    root = task.body.links[0]
 
     def places() -> np.ndarray:
         return task.world.xpos[:, root, :2].copy()

@@ -179,7 +179,7 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
         return np.linalg.norm(np.maximum(gap, 0), axis=2).min(1, initial=REACH)
 
     def plan(env_ids: np.ndarray, stance: np.ndarray) -> np.ndarray:
-        found = task.figure.measure()
+        found = task.body.measure()
         root, heading = found.root[env_ids, :2], found.heading[env_ids]
         off, length = np.empty_like(root), np.ones(len(root))
         for k, (env_id, place) in enumerate(zip(env_ids.tolist(), root, strict=True)):
@@ -247,7 +247,7 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
     heading = np.zeros(n)
 
     def plan_again(observation: np.ndarray, env_ids: np.ndarray) -> None:
-        found = task.figure.measurement
+        found = task.body.measurement
         if dribble is None:
             action = plan(env_ids, stance[env_ids])
         else:
@@ -263,7 +263,7 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
         heading[env_ids] = yaw + planned[:, 4]
 
     def policy(observation: np.ndarray) -> np.ndarray:
-        found = task.figure.measure()
+        found = task.body.measure()
         before = stance.copy()
         stance[:] = task.phase >= 0.5
         begun = (stance != before) | (task.clock.steps == 0)

@@ -111,7 +111,7 @@ class Bench:
             world.set_const(env_id)
         self.frictions = np.array(friction, float)
         self.environments.reset(seed=[int(seed) for seed in seeds])
-        actions, root = self.actions(vectors), task.figure.links[0]
+        actions, root = self.actions(vectors), task.body.links[0]
         start = world.subtree_com[:, root, 0].copy()
         elapsed, distance = np.zeros((2, count))
         cycles, going = np.zeros(count, int), np.ones(count, bool)
@@ -141,7 +141,7 @@ class Bench:
 def position(environments: VectorEnvironment) -> np.ndarray:
     """Returns the positions of the roots along the ground, (n,) m."""
     task = environments.task
-    return task.world.qpos[:, int(task.figure.pose_qpos[0])].copy()
+    return task.world.qpos[:, int(task.body.pose_qpos[0])].copy()
 
 
 def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray) -> dict[str, Any]:
@@ -154,7 +154,7 @@ def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray)
     """
     world = state['world'][0].copy()
     qpos = world[1 : 1 + copies.task.world.qpos.shape[1]]  # time precedes the positions
-    joints = np.delete(np.arange(len(qpos)), copies.task.figure.pose_qpos[:3])
+    joints = np.delete(np.arange(len(qpos)), copies.task.body.pose_qpos[:3])
     qpos[joints] += change
     return states.seal({**state, 'world': [world]})
 

@@ -36,7 +36,7 @@ def ghost(task: Any) -> Overlay:
     def add(physics: Any, scene: Any) -> None:
         # Uses a separate MjData of the same model, so that the simulation does not change.
         model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
-        addresses = task.figure.pose_qpos
+        addresses = task.body.pose_qpos
         data.qpos[addresses] = task.reference_pose(0)
         mujoco.mj_kinematics(model, data)
         before = scene.ngeom
@@ -55,7 +55,7 @@ def ghost(task: Any) -> Overlay:
 
 def root_joint(model: Any, task: Any) -> int:
     """Returns the id of the first root joint of a task's character."""
-    return int(np.flatnonzero(model.jnt_qposadr == task.figure.pose_qpos[0])[0])
+    return int(np.flatnonzero(model.jnt_qposadr == task.body.pose_qpos[0])[0])
 
 
 def has_ghost(task: Any) -> bool:
@@ -76,19 +76,19 @@ def markers(task: Any) -> Overlay:
 
 def observes_terrain(task: Any) -> bool:
     """Whether the agent observes heights of the terrain."""
-    return 'terrain' in getattr(task, 'blocks', {}) and hasattr(task, 'figure')
+    return 'terrain' in getattr(task, 'blocks', {}) and hasattr(task, 'body')
 
 
 def terrain_samples(task: Any, physics: Any) -> np.ndarray:
     """Returns where the terrain is observed, on its surface, (samples, 3) m."""
     if not task.arena.terrain.spatial:
-        body = task.figure.ids
+        body = task.body.ids
         x, _, pitch = physics.data.qpos[body.qpos[:3]]
         facing = -1.0 if abs(pitch) > np.pi / 2 and np.cos(pitch) < 0 else 1.0
         places = x + body.samples * facing
         heights = task.arena.height(places[None], slice(0, 1))[0]
         return np.stack([places, np.zeros_like(places), heights], axis=1)
-    root = task.figure.links[0]
+    root = task.body.links[0]
     (x, y, _), heading = physics.data.xpos[root], quaternion.heading(physics.data.xquat[root])
     aside, ahead = np.meshgrid(
         np.linspace(ASIDE, -ASIDE, SAMPLES), np.linspace(*AHEAD, SAMPLES), indexing='ij'

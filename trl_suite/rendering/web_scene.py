@@ -226,7 +226,7 @@ def _assign(handle: Any, **values: Any) -> None:
 def root_body(environment: Any) -> int:
     """Returns the id of the character's root body; without a character, of the first moving body."""
     model, task = environment.physics.model, environment.task
-    if getattr(task, 'figure', None) is None:
+    if getattr(task, 'body', None) is None:
         return int(np.flatnonzero(model.body_weldid)[0])
     return int(model.jnt_bodyid[root_joint(model, task)])
 

@@ -46,7 +46,7 @@ class BodyTask(Task):
     """A body on random ground whose joints are controlled; a subclass defines what it is to do.
 
     Attributes:
-      figure: the body in every simulation.
+      body: the body in every simulation.
       joint_map: the map from actions of the joints to actuators.
       travel: start of each episode, and the distance from it.
       motion: the motion that the character is to perform, if there is one; also `clip`, or `steps`.
@@ -59,7 +59,7 @@ class BodyTask(Task):
     ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
     length = 0.0  # m; of the step of a library with which episodes start
     strain = True  # whether the strain of muscles is observed
-    figure: Any  # PlanarBody or SpatialBody
+    body: Any  # PlanarBody or SpatialBody
     motion: Any  # Clip or FootstepLibrary
     finish_all: Compiled
     observe_all: Compiled
@@ -100,13 +100,13 @@ class BodyTask(Task):
             typical = typical_poses(motion, self._first)
         options, muscles = joint_options(character, config, actuation_model, motion, typical)
         if isinstance(arena, SpatialArena):
-            self.figure = SpatialBody(character, arena, 'height' in terrain_observation)
+            self.body = SpatialBody(character, arena, 'height' in terrain_observation)
         else:
             sight = VIEW_BEHIND, VIEW_AHEAD, terrain_observation
-            self.figure = PlanarBody(
+            self.body = PlanarBody(
                 character, arena, *sight, contact, muscles if self.strain else ()
             )
-        self.fields = self.figure.fields
+        self.fields = self.body.fields
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         self.joint_map = actuation.add(character, actuation_model, self.physics_timestep, **options)
 
@@ -121,7 +121,7 @@ class BodyTask(Task):
         """Draws ground and initial state, with `_begin_ground`.
 
         Returns:
-          The arguments of `figure.place`: poses, rates, and extents in the plane, or spawns.
+          The arguments of `body.place`: poses, rates, and extents in the plane, or spawns.
         """
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
@@ -151,7 +151,7 @@ class BodyTask(Task):
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         self.world.reset(env_ids)
-        self.figure.place(env_ids, *self._start(env_ids, random_states))
+        self.body.place(env_ids, *self._start(env_ids, random_states))
         for array in self.outcome[1:]:  # all but the observation
             array[env_ids] = 0
         self._begun_on_ground(env_ids)
@@ -186,15 +186,15 @@ class BodyTask(Task):
         return {}
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        self.figure.control(env_ids, action)
+        self.body.control(env_ids, action)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        self.figure.measure(env_ids, stepped=True)
+        self.body.measure(env_ids, stepped=True)
         self.finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
-        self.figure.measure(env_ids)
+        self.body.measure(env_ids)
         self.observe_all(env_ids, self._pack)
 
     def get_state(self, env_id: int) -> dict[str, Any]:
@@ -270,7 +270,7 @@ class TrackingTask(BodyTask):
         )
         self.action_map = self.joint_map
         self._start_phase = start_phases(config.start_phase)
-        self.full = *self.figure.blocks, PHASE.observed_if(phase), *extras
+        self.full = *self.body.blocks, PHASE.observed_if(phase), *extras
         given = tuple(block for block in self.full if block.name not in hidden)
         self._reflection = self._reflected(self.full)
         self.mirror = None if mirrored else self._reflected(given)
@@ -303,8 +303,8 @@ class TrackingTask(BodyTask):
         """Returns the reference, after the body was bound."""
         motion, model = self.motion, self.world.models[0]
         if isinstance(motion, Clip):
-            return Reference.of_clip(motion, self.figure, model, self.tracks)
-        return Reference.of_steps(motion, self.figure, model)
+            return Reference.of_clip(motion, self.body, model, self.tracks)
+        return Reference.of_steps(motion, self.body, model)
 
     def _bind(self, world: World) -> Any:
         """Binds body, reference and full observation; returns the `TrackingData`."""
@@ -312,7 +312,7 @@ class TrackingTask(BodyTask):
         if self.observed != self.full:
             full = np.zeros((world.n, sum(block.size for block in self.full)))
             self.saved = (*self.saved, by_name('Full', {'observation': full}))
-        self.figure.bind(world, self.joint_map, full, self.full, self.ABOUT)
+        self.body.bind(world, self.joint_map, full, self.full, self.ABOUT)
         self.reference = self._track()
         none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
         self._view = View(
@@ -329,8 +329,8 @@ class TrackingTask(BodyTask):
         )
         self._view_pack = packed(self._view)
         return TrackingData(
-            measurement=self.figure.measurement,
-            diverged=self.figure.data.diverged,
+            measurement=self.body.measurement,
+            diverged=self.body.data.diverged,
             outcome=self.outcome,
             given=self._view,
             clock=self.clock,
@@ -344,7 +344,7 @@ class TrackingTask(BodyTask):
         if self.mirrored:
             reflect_all(env_ids, action, self._view_pack)
             action = self._view.action
-        self.figure.control(env_ids, action)
+        self.body.control(env_ids, action)
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
@@ -403,7 +403,7 @@ class TrackingTask(BodyTask):
         """Returns a pose above level ground of height 0, raised by the height of the ground there."""
         place = pose[None, :2]
         height = 2 if self.character.spec.spatial else 1
-        pose[height] += self.figure.heights(np.array([env_id]), place)[0]
+        pose[height] += self.body.heights(np.array([env_id]), place)[0]
         return pose
 
 

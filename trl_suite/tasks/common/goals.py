@@ -428,7 +428,7 @@ class GoalTask(BodyTask):
 
     def _redraw_goals(self, env_ids: np.ndarray) -> None:
         """Places balls and draws goals again, where they have expired or were reached."""
-        places = self.figure.measurement.root[:, :2]
+        places = self.body.measurement.root[:, :2]
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]
             for i in wanted.tolist():

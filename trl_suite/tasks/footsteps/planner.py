@@ -96,7 +96,7 @@ class PlanTask(Planned, TrackingTask):
         """Draws the first plan of an episode, and its first goal; the stance foot is known."""
         plan, state, random = self.plan, self.state, self._random[i]
         place, angle = self.travel.origin[i, :2], self.travel.origin[i, 2]
-        feet, stance = self.figure.measurement.feet[i, :, :2], plan.stance[i]
+        feet, stance = self.body.measurement.feet[i, :, :2], plan.stance[i]
         self._redraw_size(i, always=True)
         aside = state.width[i]
         if self.goal_given:
@@ -104,7 +104,7 @@ class PlanTask(Planned, TrackingTask):
         sizes = self._next_size(i), self._next_size(i)
         plan.heading[i] = angle
         if self.goal_given:
-            self._head_for_goal(i, self.figure.measurement.root[i, :2])
+            self._head_for_goal(i, self.body.measurement.root[i, :2])
             self._lay_both(i, feet[stance], sizes)
             return
         # The feet land on both sides of a line through the start, at half a width from it.
@@ -115,7 +115,7 @@ class PlanTask(Planned, TrackingTask):
     def _replan(self, i: int) -> None:
         """Draws the next plan of a simulation at a switch of stance."""
         plans, plan, random = self._drawn_plans, self.plan, self._random[i]
-        measurement, stance, turn = self.figure.measurement, plan.stance[i], 0.0
+        measurement, stance, turn = self.body.measurement, plan.stance[i], 0.0
         if plans.from_root and random.uniform() < plans.from_root:
             turn = np.clip(random.normal(0, plans.root_turn), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
             ranges = plans.root_length, plans.root_width
@@ -182,5 +182,5 @@ class PlanTask(Planned, TrackingTask):
         step = np.array([size[0], size[1] * SIDE[foot]])
         place = place + quaternion.rotate_xy(step, self.plan.heading[i])
         self.plan.landing[i, which, :2] = place
-        self.plan.landing[i, which, 2] = self.figure.heights(np.array([i]), place[None])[0]
+        self.plan.landing[i, which, 2] = self.body.heights(np.array([i]), place[None])[0]
         return place

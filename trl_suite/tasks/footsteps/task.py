@@ -151,7 +151,7 @@ class Footsteps(PlanTask):
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         plan, state = self.plan, self.state
-        self.figure.measure(env_ids)
+        self.body.measure(env_ids)
         plan.stance[env_ids] = self.phase[env_ids] >= 0.5
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
@@ -171,7 +171,7 @@ class Footsteps(PlanTask):
     # A step.
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        measurement = self.figure.measure(env_ids, stepped=True)
+        measurement = self.body.measure(env_ids, stepped=True)
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
             for i in switched.tolist():
@@ -255,7 +255,7 @@ class SpatialFootsteps(Footsteps):
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places, the planned heading and the goal."""
-        root = self.world.xpos[env_id, self.figure.links[0]]
+        root = self.world.xpos[env_id, self.body.links[0]]
         shown = plan_markers(env_id, root, self.plan)
         if self.goal_given:
             shown.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))

@@ -97,7 +97,7 @@ class GaitTask(Task):
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
         self.steps_vary = interface == 'parameters'
-        self.figure = PlanarBody(character, arena, rules.BEHIND, rules.AHEAD, rules.SAMPLES)
+        self.body = PlanarBody(character, arena, rules.BEHIND, rules.AHEAD, rules.SAMPLES)
         parameters = load(character.spec.name, config.base_actions)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
@@ -118,7 +118,7 @@ class GaitTask(Task):
                 tuple(f'base_action_{i}' for i in range(count)), 'preference', '1',
                 np.zeros(count), np.ones(count),
             )  # fmt: skip
-        self.observed = rules.observed_blocks(self.figure.blocks, character.spec, parameters)
+        self.observed = rules.observed_blocks(self.body.blocks, character.spec, parameters)
         self.terms = tuple(
             dataclasses.replace(term, weight=parameters.reward[term.name]) for term in rules.TERMS
         )
@@ -137,12 +137,12 @@ class GaitTask(Task):
 
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
-        figure, gait = self.figure, self.gait
-        measured = np.zeros((n, sum(block.size for block in figure.blocks)))
-        figure.bind(world, self._torques, measured, figure.blocks)
+        body, gait = self.body, self.gait
+        measured = np.zeros((n, sum(block.size for block in body.blocks)))
+        body.bind(world, self._torques, measured, body.blocks)
         gait.bind(world)
         self.state = allocated(rules.GaitTaskState, n, action=np.zeros(len(self.action_map)))
-        self._allocate(n, world.qpos[:, figure.pose_qpos[0]])
+        self._allocate(n, world.qpos[:, body.pose_qpos[0]])
         self.saved = (self.state, gait.state, self.outcome)
         self.info_arrays |= {
             'fell': self.state.fell,
@@ -154,7 +154,7 @@ class GaitTask(Task):
         stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
         pitch = parameters.observe_pitch
         self.data = rules.GaitData(
-            body=figure.data,
+            body=body.data,
             gait=gait.rules,
             terms=terms_data(self.terms),
             interruption=np.zeros(n, int),
@@ -180,7 +180,7 @@ class GaitTask(Task):
 
     def _columns(self) -> np.ndarray:
         """Returns the columns of the body's blocks in an observation, by stance leg, (2, size)."""
-        links, body = self.character.spec.links, self.figure.data.columns
+        links, body = self.character.spec.links, self.body.data.columns
         order = np.arange(len(links))
         mirrored = order.copy()
         for right, left in self.character.spec.mirror:
@@ -197,15 +197,15 @@ class GaitTask(Task):
 
     def _start_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns initial pose and rates, (1, D), and extents of the geoms, (1, 3, G)."""
-        start, figure = self.gait.parameters.start, self.figure
-        pose, rates = np.zeros((2, 1, len(figure.pose_qpos)))
+        start, body = self.gait.parameters.start, self.body
+        pose, rates = np.zeros((2, 1, len(body.pose_qpos)))
         pose[0, 1:3], rates[0, :3] = (start['height'], start['pitch']), start['velocity']
         for name, (angle, rate) in start['joints'].items():
             pose[0, 3 + self.gait.number[name]] = angle
             rates[0, 3 + self.gait.number[name]] = rate
-        data = self.world.posed(figure.pose_qpos, pose[0])
-        root = data.xpos[figure.links[0]][::2]
-        extents = link_extents(self.world.models[0], data, figure.geoms, root)
+        data = self.world.posed(body.pose_qpos, pose[0])
+        root = data.xpos[body.links[0]][::2]
+        extents = link_extents(self.world.models[0], data, body.geoms, root)
         return pose, rates, extents[None]
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
@@ -225,7 +225,7 @@ class GaitTask(Task):
             )
             self.arena.begin_episode(i, strip)
         self.world.reset(env_ids)
-        self.figure.place(env_ids, poses, rates, extents)
+        self.body.place(env_ids, poses, rates, extents)
         for array in (*self.state, *self.outcome[1:]):  # all but the observation
             array[env_ids] = 0
         rules.observe_all(env_ids, True, self._pack)
@@ -239,7 +239,7 @@ class GaitTask(Task):
         while rules.run(env_ids, self.watch is not None, self._pack):
             leaving = env_ids[interruption[env_ids] == rules.GROUND]
             if len(leaving):
-                self.figure.recentre(leaving)
+                self.body.recentre(leaving)
             if self.watch is not None and (interruption[env_ids] == rules.LOOK).any():
                 self.watch()
 

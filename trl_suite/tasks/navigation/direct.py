@@ -242,16 +242,16 @@ class DirectNavigation(GoalTask, TrackingTask):
 
     def _bind(self, world: World) -> DirectData:
         tracking, aims = super()._bind(world), self._bind_goals(world, SPEED)
-        return DirectData(tracking, self.figure.data.physics, aims)
+        return DirectData(tracking, self.body.data.physics, aims)
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
         self._begin_goals(env_ids)
         if self.ball:
             self.ball.state.begin[env_ids] = self.ball.place[env_ids]
-        self.goals.walker[env_ids] = self.figure.measure(env_ids).com[env_ids]
+        self.goals.walker[env_ids] = self.body.measure(env_ids).com[env_ids]
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        self.figure.measure(env_ids, stepped=True)
+        self.body.measure(env_ids, stepped=True)
         if advance_all(env_ids, self._pack):
             self._redraw_goals(env_ids)
         self.finish_all(env_ids, self._pack)

@@ -158,7 +158,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         super().__init__(character, arena, steps, config, actuation_model)
         self.controller = footstep_controller.load(config.controller)
         policy = self.controller.policy
-        blocks = *self.figure.blocks, PHASE, CONTACT, PLAN
+        blocks = *self.body.blocks, PHASE, CONTACT, PLAN
         if policy is not None and {(b.name, b.size) for b in blocks}.issuperset(policy.blocks):
             # It may have been trained without some of them.
             blocks = tuple(block.observed_if(block.name in dict(policy.blocks)) for block in blocks)
@@ -211,9 +211,9 @@ class HierarchicalNavigation(Planned, GoalTask):
         }
         self._controller_observation = np.zeros((n, sum(block.size for block in blocks)))
         self._joint_action = np.zeros((n, len(self.joint_map)))
-        self.figure.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
+        self.body.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
         return rules.PlanningData(
-            body=self.figure.data,
+            body=self.body.data,
             outcome=self.outcome,
             clock=self.clock,
             travel=self.travel,
@@ -249,7 +249,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         for array in (*self.state, plan.landing_error, plan.heading_error, plan.landed):
             array[env_ids] = 0
         self._begin_goals(env_ids)
-        measurement = self.figure.measure(env_ids)
+        measurement = self.body.measure(env_ids)
         # Before the first action, the plan is the current positions of the feet.
         plan.heading[env_ids] = measurement.heading[env_ids]
         stance = plan.stance[env_ids]
@@ -273,7 +273,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         while len(going):
             if self.interface == 'plan':
                 self._joint_action[going] = self.controller(self._controller_observation[going])
-            self.figure.control(going, self._joint_action)
+            self.body.control(going, self._joint_action)
             self.world.step(self.config.substeps, going)
             count = rules.finish_control_steps(going, self._pack)
             if self.watch is not None:
@@ -310,7 +310,7 @@ class HierarchicalNavigation(Planned, GoalTask):
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the plan, past positions of the centre of mass, and the goal."""
-        root = self.world.xpos[env_id, self.figure.links[0]]
+        root = self.world.xpos[env_id, self.body.links[0]]
         return [*plan_markers(env_id, root, self.plan), *super().markers(env_id)]
 
 

@@ -78,7 +78,7 @@ class Pushes(Component):
         super().bind(world, outcome)
         task: Any = self.task
         pushes: Any = world.engine.pushes
-        links, spec = task.figure.links, task.character.spec
+        links, spec = task.body.links, task.character.spec
         push, k = self._config, self._series
         pushes.ranges[k, FORCE] = push.speed if push.force is None else push.force
         pushes.ranges[k, DURATION], pushes.ranges[k, INTERVAL] = push.duration, push.interval

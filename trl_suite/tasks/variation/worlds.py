@@ -144,9 +144,9 @@ class Worlds(Component):
         self._config = config
 
     def added_to(self, task: Task) -> None:
-        if not hasattr(task, 'figure') or not hasattr(task, 'character'):
+        if not hasattr(task, 'body') or not hasattr(task, 'character'):
             raise ValueError(
-                f'randomize: the task {type(task).__name__} has no attributes `character` and `figure`, '
+                f'randomize: the task {type(task).__name__} has no attributes `character` and `body`, '
                 'as all tasks of the suite do'
             )
         self._spatial = task.character.spec.spatial
@@ -163,10 +163,10 @@ class Worlds(Component):
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         task: Any = self.task
-        figure, varied = task.figure, self._config.varied
+        body, varied = task.body, self._config.varied
         constants = getattr(task.root_entity, 'set_inertia', None)
-        dofs = figure.pose_dof[6 if self._spatial else 3 :]
-        self.variation = Variation(world, varied, figure.links, dofs, constants)
+        dofs = body.pose_dof[6 if self._spatial else 3 :]
+        self.variation = Variation(world, varied, body.links, dofs, constants)
         properties = self.variation.properties
         self.saved = (properties,)
         self.info_arrays = {'world': {name: getattr(properties, name) for name in varied}}

@@ -148,18 +148,18 @@ class Walk(BodyTask):
             character, arena, None, config, actuation_model, terrain_observation=observed
         )
         self.action_map = self.joint_map
-        self.observed = *self.figure.blocks, TARGET_HEADING.observed_if(self._spatial)
+        self.observed = *self.body.blocks, TARGET_HEADING.observed_if(self._spatial)
 
     def _bind(self, world: World) -> WalkData:
-        figure = self.figure
-        figure.bind(world, self.action_map, self.outcome.observation, self.observed)
+        body = self.body
+        body.bind(world, self.action_map, self.outcome.observation, self.observed)
         self._pose, self._extents = self._posture(world)
         # Height of the root above the ground in the working posture, m.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
         return WalkData(
-            measurement=figure.measurement,
-            diverged=figure.data.diverged,
+            measurement=body.measurement,
+            diverged=body.data.diverged,
             columns=columns(self.observed),
             travel=self.travel,
             outcome=self.outcome,
@@ -172,7 +172,7 @@ class Walk(BodyTask):
 
     def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
         """Returns the initial pose, with the root at the origin, and the extents of its geoms."""
-        figure, spec = self.figure, self.character.spec
+        body, spec = self.body, self.character.spec
         values: list[float] = [0, 0, 0, 1, 0, 0, 0] if self._spatial else [0, 0, 0]
         for joint, ball in zip(spec.joints.values(), self.character.spherical, strict=True):
             if ball:
@@ -181,8 +181,8 @@ class Walk(BodyTask):
             else:
                 values.append(float(np.ravel(joint.target)[0]))
         pose = np.array(values)
-        data = world.posed(figure.pose_qpos, pose)
-        return pose, link_extents(world.models[0], data, figure.geoms, np.zeros(2))
+        data = world.posed(body.pose_qpos, pose)
+        return pose, link_extents(world.models[0], data, body.geoms, np.zeros(2))
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
@@ -190,7 +190,7 @@ class Walk(BodyTask):
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
             self._begin_ground(i, self.terrain_seed(i, random_state), random_state)
         poses = np.tile(self._pose, (len(env_ids), 1))
-        rates = np.zeros((len(env_ids), len(self.figure.pose_dof)))
+        rates = np.zeros((len(env_ids), len(self.body.pose_dof)))
         if self._spatial:
             return poses, rates, self.travel.origin[env_ids]
         return poses, rates, np.tile(self._extents, (len(env_ids), 1, 1))
@@ -205,7 +205,7 @@ class Walk(BodyTask):
 
 def speed_ratio(task: Any) -> np.ndarray:
     """Speed along the target heading over `task.full_speed`, clipped to [0, 1], (n,)."""
-    velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
+    velocity = task.world.qvel.take(task.body.pose_dof[:2], 1)
     if not task.character.spec.spatial:
         velocity = velocity * [1.0, 0.0]  # the second component is vertical
     return np.clip(task.along(velocity) / task.full_speed, 0, 1)
