@@ -180,6 +180,7 @@ def control_all(env_ids: np.ndarray, action: np.ndarray, body: BodyData) -> int:
 class PlanarBody(Body):
     """A planar character in every simulation of a world; see `Body`."""
 
+    # The first two are compiled functions, not methods: they take a pack.
     control_all, measure_all, physics = control_all, measure_all, PlanarState
     arena: PlanarArena
 

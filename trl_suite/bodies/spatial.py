@@ -253,6 +253,7 @@ class SpatialBody(Body):
     """A three-dimensional character in every simulation of a world; see `Body`."""
 
     fields = ('xquat',)
+    # The first two are compiled functions, not methods: they take a pack.
     control_all, measure_all, physics = control_all, measure_all, SpatialState
     arena: SpatialArena
 

@@ -150,7 +150,7 @@ call = Compiled(_call, _call_native)
 
 @compiled
 def arrays_to_physics(i: int, engine: Engine) -> None:
-    """Copies the fields that tasks may write from the arrays to the physics."""
+    """Copies the fields that tasks may write from the arrays, unless these are views, to the physics."""
     for k in range(min(engine.written, len(engine.sizes))):
         size = engine.sizes[k]
         copy_floats(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)

@@ -47,7 +47,7 @@ class Core:
       world: the simulations of the physics.
       random: random stream of each simulation, from which resets draw.
       seeds: seeds of the random streams, (n,) uint32; 0 if they are not known.
-      steps: control steps since the beginning of the episode, (n,).
+      steps: steps since the beginning of the episode, (n,).
       ended: whether the episode has ended, so that a reset is needed, (n,) bool.
       fresh: whether no simulation was ever reset.
       signature: of saved states, see `states`.
@@ -135,7 +135,7 @@ class Core:
 
         Args:
           ids: index of a simulation, or indices of several.
-          step_limit: in control steps; None for no limit.
+          step_limit: in steps; None for no limit.
           time_limit: in s.
 
         Returns:
@@ -199,7 +199,7 @@ class Core:
 
 
 class Environment(composer.Environment):
-    """`composer.Environment` with all substeps of a control step in one call.
+    """`composer.Environment` with all substeps of a step in one call.
 
     Differences from composer: substeps run in C (`before_substep` and `after_substep` hooks are
     rejected), observation blocks bypass the observation updater, divergence ends the episode
@@ -214,7 +214,8 @@ class Environment(composer.Environment):
       core: the simulation.
       blocks: slice of each observation block in the flat vector.
       action_map: the map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`).
-      step_limit: control steps after which an episode is truncated, or None.
+      step_limit: steps after which an episode is truncated, or None: control steps of 1/30 s, in
+        planning tasks footsteps, in gaits cycles.
       at_limit: whether the last step reached the step or time limit, also if it failed.
     """
 
@@ -234,7 +235,7 @@ class Environment(composer.Environment):
 
         Args:
           task: a task that no other environment uses.
-          step_limit: control steps after which an episode is truncated.
+          step_limit: steps after which an episode is truncated.
           time_limit: simulated time in s after which an episode is truncated.
           random: seed; drawn from the operating system if None.
           flat_observation: return all blocks as one vector, under the key 'observations'.

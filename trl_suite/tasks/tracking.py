@@ -474,7 +474,7 @@ def in_left_stance(i: int, view: View) -> bool:
 
 @compiled
 def publish(i: int, view: View, outcome: Outcome) -> None:
-    """Writes the observation from the full observation."""
+    """Writes the observation from the full observation, unless they are the same array."""
     full, observation, left = view.full, outcome.observation, in_left_stance(i, view)
     for k in range(len(view.kept)):
         column = view.kept[k]

@@ -69,7 +69,7 @@ class FootstepPlan(NamedTuple):
       landing_error: horizontal distance of the last foot that landed from its landing place, (n,)
         m; 0 before the first landing.
       heading_error: magnitude of the heading error at that time, (n,) rad.
-      landed: whether a foot landed in the last step, (n,).
+      landed: whether a foot landed in the last step, by the clock; it may still be in the air, (n,).
     """
 
     stance: np.ndarray = WHOLE
@@ -115,7 +115,7 @@ def update_stance(i: int, phase: float, measurement: Measurement, plan: Footstep
     stance = 1 if phase >= 0.5 else 0
     if stance == plan.stance[i]:
         return False
-    plan.stance[i] = stance  # the foot that has just landed
+    plan.stance[i] = stance  # the foot that has just landed, by the clock
     x = measurement.feet[i, stance, 0] - plan.landing[i, 0, 0]
     y = measurement.feet[i, stance, 1] - plan.landing[i, 0, 1]
     plan.landing_error[i] = math.hypot(x, y)
