@@ -38,7 +38,6 @@ from trl_suite.characters import model_file
 from trl_suite.characters.character import Character, CharacterSpec, Joint
 from trl_suite.characters.inspect import KINDS, ModelInspector
 from trl_suite.characters.model_file import (
-    Rotation,
     check_numbers,
     compiled,
     find_root,
@@ -47,6 +46,7 @@ from trl_suite.characters.model_file import (
     turned,
 )
 from trl_suite.characters.specs import CHARACTERS
+from trl_suite.motion import quaternion
 from trl_suite.util import errors, limited
 from trl_suite.util.files import check_size, existing
 from trl_suite.util.options import checked
@@ -172,7 +172,7 @@ def _read(
     own_turn = model.body_quat[number]
     is_turned = abs(own_turn[0]) < 1 - 1e-6
     if is_turned or rotation is not None:
-        whole = Rotation((1, 0, 0, 0) if rotation is None else rotation).quaternion(own_turn)
+        whole = own_turn if rotation is None else quaternion.multiply(rotation, own_turn)
         model = turned(spec, model.body(number).name, whole)
     found = ModelInspector(model, number, spatial)
     if is_turned:

@@ -6,7 +6,6 @@ import itertools
 import os
 import pathlib
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -14,6 +13,7 @@ import numpy as np
 from lxml import etree
 
 from trl_suite.characters import meshes
+from trl_suite.motion import quaternion
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
@@ -212,9 +212,8 @@ def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjMod
     if body.explicitinertial:
         model = compiled(spec)  # resolves orientations that are not given as quaternions
         number = model.body(root).id
-        turn = Rotation(rotation)
-        body.ipos = turn.vector(model.body_ipos[number])
-        body.iquat = turn.quaternion(model.body_iquat[number])
+        body.ipos = quaternion.rotate(rotation, model.body_ipos[number])
+        body.iquat = quaternion.multiply(rotation, model.body_iquat[number])
         body.inertia, body.fullinertia = model.body_inertia[number], np.full(6, np.nan)
         body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.quat = 1, 0, 0, 0
@@ -226,13 +225,13 @@ def flat(text: str) -> str:
     """Returns MJCF, as `MjSpec.to_xml` writes it, without frames, which dm_control does not read."""
     tree = etree.fromstring(text.encode())
     for frame in reversed([*tree.iter('frame')]):  # the innermost first
-        turn = Rotation(_numbers(frame, 'quat', (1, 0, 0, 0)))
-        origin = _numbers(frame, 'pos', (0, 0, 0))
+        turn, origin = _place(frame)
         above, place = frame.getparent(), frame.getparent().index(frame)
         for child in reversed(frame):
             if child.tag in ('body', 'geom', 'site', 'camera', 'frame'):
-                position = origin + turn.vector(_numbers(child, 'pos', (0, 0, 0)))
-                rotation = turn.quaternion(_numbers(child, 'quat', (1, 0, 0, 0)))
+                rotation, position = _place(child)
+                position = origin + quaternion.rotate(turn, position)
+                rotation = quaternion.multiply(turn, rotation)
                 child.set('pos', ' '.join(map(repr, position.tolist())))
                 child.set('quat', ' '.join(map(repr, rotation.tolist())))
             key = 'childclass' if child.tag in ('body', 'frame') else 'class'
@@ -243,23 +242,7 @@ def flat(text: str) -> str:
     return etree.tostring(tree, encoding='unicode')
 
 
-def _numbers(element: etree._Element, key: str, default: Sequence[float]) -> np.ndarray:
-    text = element.get(key)
-    return np.array(default if text is None else text.split(), float)
-
-
-class Rotation:
-    """A rotation that is applied to vectors and to other rotations."""
-
-    def __init__(self, quaternion: Sequence[float] | np.ndarray) -> None:
-        self._turn = np.array(quaternion, float)
-
-    def vector(self, vector: np.ndarray) -> np.ndarray:
-        result = np.empty(3)
-        mujoco.mju_rotVecQuat(result, vector, self._turn)
-        return result
-
-    def quaternion(self, quaternion: np.ndarray) -> np.ndarray:
-        result = np.empty(4)
-        mujoco.mju_mulQuat(result, self._turn, quaternion)
-        return result
+def _place(element: etree._Element) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rotation, as a quaternion wxyz, and the position of an element, m."""
+    quat, pos = element.get('quat', '1 0 0 0'), element.get('pos', '0 0 0')
+    return np.array(quat.split(), float), np.array(pos.split(), float)
