@@ -13,7 +13,7 @@ from helpers import assert_refused, height_map, surface_velocity, velocity_map
 from trl_suite import terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
-from trl_suite.terrain.spatial import generators
+from trl_suite.terrain import generators
 from trl_suite.terrain.spatial import windows as spatial_ground
 
 TIMESTEP = 1 / 300  # s
@@ -173,7 +173,7 @@ class GeometryTest(parameterized.TestCase):
                 ),
             )  # fmt: skip
 
-        self.addCleanup(generators._generators.pop, 'turned3d')
+        self.addCleanup(generators._spatial.pop, 'turned3d')
         for seed in range(4):
             stage = Stage({'Type': 'turned3d'}, (seed,))
             x, y = np.random.default_rng(seed).uniform(-13, 13, (2, 600))
@@ -189,7 +189,7 @@ class GeometryTest(parameterized.TestCase):
         def steep(parameters, rng):
             return terrain.Layout(level=None, grid=lambda i, j: np.add.outer(i, 0 * j) * 0.5)
 
-        self.addCleanup(generators._generators.pop, 'steep3d')
+        self.addCleanup(generators._spatial.pop, 'steep3d')
         arena = Stage('dynamic_obstacles3d', (5, 6, 7), batch=True).arena
         recentre = functools.partial(functools.partial, arena.recentre, np.arange(3))
         assert_refused(

@@ -26,7 +26,7 @@ from trl_suite.characters import inspect, model_file
 from trl_suite.describe import tasks
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk.task import Walk
-from trl_suite.terrain.planar import generators
+from trl_suite.terrain import generators
 from trl_suite.util import limited, program
 from trl_suite.vector import VectorEnvironment
 
@@ -927,7 +927,7 @@ class ExampleTest(FolderTest):
 
     def setUp(self):
         super().setUp()
-        self.enterContext(mock.patch.dict(generators._generators))  # they register types
+        self.enterContext(mock.patch.dict(generators._planar))  # they register types
 
     def test_code_of_the_page_runs(self):
         page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')

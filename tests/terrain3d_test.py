@@ -10,7 +10,8 @@ from absl.testing import absltest, parameterized
 from helpers import assert_refused, height_map, surface_velocity, velocity_map
 
 from trl_suite import terrain
-from trl_suite.terrain.spatial import features, generators, noise
+from trl_suite.terrain import generators
+from trl_suite.terrain.spatial import features, noise
 from trl_suite.terrain.spatial import windows as spatial_ground
 
 GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
@@ -215,7 +216,7 @@ class ShapeTest(parameterized.TestCase):
         def grid(parameters, rng):
             return terrain.Layout(level=None, grid=terrain.Grid((0, 0), heights))
 
-        self.addCleanup(generators._generators.pop, 'test_grid3d')
+        self.addCleanup(generators._spatial.pop, 'test_grid3d')
         ground = make({'Type': 'test_grid3d'})
         # The common edge runs from the back left (0, 0.2) to the front right corner (0.2, 0).
         self.assertAlmostEqual(ground.height(0.1, 0.1), (1 + 4) / 2)
@@ -587,9 +588,9 @@ class FileTest(parameterized.TestCase):
 class RegisterTest(parameterized.TestCase):
     def setUp(self):
         super().setUp()
-        before = dict(generators._generators)
-        self.addCleanup(generators._generators.update, before)
-        self.addCleanup(generators._generators.clear)
+        before = dict(generators._spatial)
+        self.addCleanup(generators._spatial.update, before)
+        self.addCleanup(generators._spatial.clear)
 
     def test_new_type(self):
         @terrain.register3d('turned3d', {'YawMin': 0.2, 'YawMax': 0.4})
@@ -778,7 +779,7 @@ class SurroundingsTest(parameterized.TestCase):
             )
             return terrain.Layout(boxes=blocks)
 
-        self.addCleanup(generators._generators.pop, 'crowd3d')
+        self.addCleanup(generators._spatial.pop, 'crowd3d')
         found = around({'Type': 'crowd3d'}, range(2))
         self.assertEqual(found.arrays.bins[0, 3, 5].tolist(), [0, 90])  # they do not fit into bins
         x, y = np.random.default_rng(0).uniform(-15, 15, (2, 2, 500))

@@ -12,7 +12,7 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest, assert_refused, assert_uniform
 
 from trl_suite import terrain
-from trl_suite.terrain.planar import generators
+from trl_suite.terrain import generators
 
 # The example printed in the paper.
 PAPER = """
@@ -431,9 +431,6 @@ class RefusalTest(FolderTest):
             for name in ('hills3d', 'dynamic_obstacles3d')
         )
 
-        def draw(length, kind='flat'):
-            return generators.draw(f'var2d_{kind}', {}, length, rng)
-
         assert_refused(
             self,
             *((lambda c=c, x=x: c(x), '') for x in (math.nan, math.inf, -math.inf, 1.1e6, -1.1e6) for c in (
@@ -442,8 +439,7 @@ class RefusalTest(FolderTest):
             (lambda: strip.window(10**9, 10), ''), (lambda: strip.window(0, 10**9), ''),
             (lambda: strip.window(0, 0), 'count must be positive, not 0'),
             (lambda: self.strip(spawn='upstrem'), "'upstrem'"),
-            *((lambda x=x: draw(x), 'length') for x in (0, -1, math.nan, math.inf, 1e9)),
-            (lambda: draw(1.0, 'flt'), 'var2d_flat'),
+            (lambda: generators.draw('var2d_flt', {}, 1.0, rng), 'var2d_flat'),
             *((lambda x=x: terrain.load('gaps').parameters(x), 'terrain_level is .*; expected a number')
               for x in (math.nan, True, '0')),
             (lambda: terrain.PlanarGround(terrain.load('hills3d'), 0), 'hills3d.*three-dimensional'),
@@ -464,9 +460,9 @@ class RegisterTest(parameterized.TestCase):
 
     def setUp(self):
         super().setUp()
-        before = dict(generators._generators)
-        self.addCleanup(generators._generators.update, before)
-        self.addCleanup(generators._generators.clear)
+        before = dict(generators._planar)
+        self.addCleanup(generators._planar.update, before)
+        self.addCleanup(generators._planar.clear)
 
     def test_new_type(self):
         @terrain.register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})

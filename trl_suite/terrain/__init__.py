@@ -24,13 +24,19 @@ terrain.save_mesh(forest, 'forest.obj', low=-20, high=20)
 """
 
 from trl_suite.terrain.custom import from_function, from_heights, from_image, from_mesh
+from trl_suite.terrain.generators import (
+    GENERATORS,
+    GENERATORS3D,
+    SPACING,
+    Parameter,
+    Profile,
+    register,
+    register3d,
+)
 from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
-from trl_suite.terrain.planar.generators import GENERATORS, SPACING, Profile, register
 from trl_suite.terrain.planar.ground import PlanarGround
-from trl_suite.terrain.registry import Parameter
 from trl_suite.terrain.spatial.features import IDLE
-from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
 from trl_suite.terrain.spatial.surroundings import Surroundings, capacity

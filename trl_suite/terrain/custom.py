@@ -28,10 +28,8 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain import mesh
+from trl_suite.terrain.generators import START_SPAN, Parameters, register3d, register_line
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import register_line
-from trl_suite.terrain.registry import START_SPAN, Parameters
-from trl_suite.terrain.spatial.generators import register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util import errors
 from trl_suite.util.files import check_size, existing

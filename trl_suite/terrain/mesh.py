@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.terrain.planar.generators import SPACING
+from trl_suite.terrain.generators import SPACING
 from trl_suite.terrain.planar.ground import PlanarGround
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Boxes

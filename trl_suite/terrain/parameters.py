@@ -42,9 +42,10 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.terrain.planar.generators import GENERATORS
-from trl_suite.terrain.registry import Generator, check
-from trl_suite.terrain.spatial.generators import GENERATORS3D
+# These register the original's types.
+import trl_suite.terrain.planar.features
+import trl_suite.terrain.spatial.features  # noqa: F401
+from trl_suite.terrain.generators import GENERATORS, GENERATORS3D, Generator, check
 from trl_suite.terrain.spatial.layout import GRID
 from trl_suite.util.errors import check_known, is_number, unknown
 from trl_suite.util.files import existing, read_json

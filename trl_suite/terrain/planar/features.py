@@ -19,8 +19,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import SPACING, Profile, cells, register
-from trl_suite.terrain.registry import Parameter, Parameters, limited
+from trl_suite.terrain.generators import (
+    SPACING,
+    Parameter,
+    Parameters,
+    Profile,
+    cells,
+    limited,
+    register,
+)
 from trl_suite.util import random
 from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 

@@ -10,9 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.features import flat
-from trl_suite.terrain.planar.generators import (
+from trl_suite.terrain.generators import (
     GENERATORS,
     LONGEST,
     SPACING,
@@ -21,6 +19,8 @@ from trl_suite.terrain.planar.generators import (
     cells,
     draw,
 )
+from trl_suite.terrain.parameters import Terrain
+from trl_suite.terrain.planar.features import flat
 
 STRETCH = 20.0  # m; nominal length generated at once; slopes restart in every stretch
 KEPT = 50.0  # m; ground farther from the latest query is forgotten

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import BORDER, SPACING, cells
+from trl_suite.terrain.generators import BORDER, SPACING, cells
 from trl_suite.util.compiled import compiled_inline, nearest_index
 
 FARTHEST = 1e4  # m from its window; a character that is suddenly farther away is lost

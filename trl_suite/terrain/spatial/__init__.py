@@ -1,5 +1,1 @@
-"""Three-dimensional terrain. Importing this package registers the original's terrain types."""
-
-from trl_suite.terrain.spatial import features
-
-__all__ = ['features']
+"""Three-dimensional terrain."""

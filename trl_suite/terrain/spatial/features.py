@@ -15,9 +15,8 @@ import math
 
 import numpy as np
 
-from trl_suite.terrain.registry import Parameter, Parameters, limited
+from trl_suite.terrain.generators import Parameter, Parameters, limited, register3d
 from trl_suite.terrain.spatial import noise
-from trl_suite.terrain.spatial.generators import register3d
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, GridFunction, Layout, Movers, boxes
 from trl_suite.terrain.spatial.trail import AMPLITUDE, FREQUENCY, Trail
 from trl_suite.util.compiled import compiled

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trl_suite.terrain.generators import LONGEST, draw3d
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import LONGEST
 from trl_suite.terrain.planar.ground import seed_sequence
-from trl_suite.terrain.spatial.generators import draw3d
 from trl_suite.terrain.spatial.layout import GRID, Boxes, Layout
 
 TRAIL_SPAN = 40.0  # m; characters start on a trail within a square of this half side at the origin

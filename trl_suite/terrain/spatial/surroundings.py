@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trl_suite.terrain.generators import BORDER
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import BORDER
 from trl_suite.terrain.spatial import index
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.ground import SpatialGround

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import BORDER
+from trl_suite.terrain.generators import BORDER
 from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
 from trl_suite.util.compiled import compiled, compiled_inline, nearest_index
 
