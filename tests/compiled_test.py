@@ -249,23 +249,21 @@ class LockTest(FolderTest):
 
     def setUp(self):
         super().setUp()
-        self.locked, self.busy = set(), lambda: False
-        flags = {'LOCK_EX': 2, 'LOCK_NB': 4, 'LOCK_UN': 8, 'lockf': self._lockf}
+        self.busy, hash_ = lambda: False, self.folder / 'hash'
+        locks = types.SimpleNamespace(LOCK_EX=2, LOCK_NB=4, flock=self._flock)
         for owner, name, value in (
-            (files, 'fcntl', types.SimpleNamespace(**flags)),
-            (module, 'cache_folder', lambda: self.folder / 'hash'),
-        ):
+            (files, 'fcntl', locks), (module, 'cache_folder', lambda: hash_),
+        ):  # fmt: skip
             self.enter_context(mock.patch.object(owner, name, value))
-        (self.folder / 'hash').mkdir()
-        self.addCleanup(machine_code._lock_file.cache_clear)
+        hash_.mkdir()
 
-    def _lockf(self, file, operation, size, place):
-        if operation == 8:
-            self.locked.discard(place)
-        elif self.busy():
-            raise OSError(errno.EAGAIN, 'busy')
-        else:
-            self.locked.add(place)
+    def _flock(self, file, operation):
+        if self.busy():
+            raise BlockingIOError
+
+    def assert_ended(self):
+        """No lock is held."""
+        self.assertEmpty(machine_code._held._exit_callbacks)
 
     def test_an_interrupt_ends_the_wait(self):
         """Interrupts are postponed otherwise."""
@@ -273,7 +271,7 @@ class LockTest(FolderTest):
         self.busy = lambda: signal.raise_signal(signal.SIGINT) or True
         with self.assertRaises(KeyboardInterrupt):
             function(1.0)
-        self.assertEqual((self.locked, machine_code._pending), (set(), []))
+        self.assert_ended()
         self.assertIs(signal.getsignal(signal.SIGINT), before)
         self.busy = lambda: False
         self.assertEqual(function(1.0), 7.0)
@@ -291,7 +289,7 @@ class LockTest(FolderTest):
         self.busy = lambda: False
         with self.assertRaises(numba.core.errors.NumbaError):
             compiled(allocates.function)(3)
-        self.assertEqual((self.locked, machine_code._pending), (set(), []))
+        self.assert_ended()
 
 
 @compiled
@@ -514,11 +512,20 @@ class CacheTest(FolderTest):
     def test_a_process_that_is_killed_while_it_compiles(self):
         self.ask(FOLDER)
         holder = self.start("""
-            import fcntl, pathlib, signal
-            file = next(pathlib.Path('cache').glob('trl_suite/kernels')).joinpath('lock').open('ab')
-            fcntl.lockf(file, fcntl.LOCK_EX)
-            print('locked', flush=True)
-            signal.pause()
+            import signal
+            from numba.core import event
+            from trl_suite.outer import outer
+
+            class Compiling(event.Listener):
+                def on_start(self, _):
+                    print('locked', flush=True)
+                    signal.pause()
+
+                def on_end(self, _):
+                    pass
+
+            event.register('numba:run_pass', Compiling())
+            outer(1.0)
         """)
         self.assertEqual(holder.stdout.readline(), 'locked\n')
         waiting = self.start(f"""

@@ -281,6 +281,6 @@ def _forget(folder: pathlib.Path) -> None:
             status = path.lstat()
             own = stat.S_ISDIR(status.st_mode) and re.fullmatch('[0-9a-f]{16}', path.name)
             if own and status.st_mtime < time.time() - UNUSED:
-                for file in path.glob('*.nbc'):
+                for file in (*path.glob('*.nbc'), *path.glob('*.lock')):
                     file.unlink()
                 path.rmdir()

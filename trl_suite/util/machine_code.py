@@ -17,6 +17,7 @@ can write two entries of its index for one file.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import gc
@@ -30,7 +31,7 @@ import time
 import types
 import warnings
 from collections.abc import Callable
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 import numba
 from numba.core.caching import NullCache
@@ -145,8 +146,8 @@ def _load(path: pathlib.Path | None, signature: Any, target_context: Any) -> Com
             return None
 
 
-# The file of the function that is compiled, or waited for, if there is one.
-_pending: list[pathlib.Path | None] = []
+# What ends with the compilation of a function: its lock, and the notice.
+_held = contextlib.ExitStack()
 
 
 def _loaded_or_compiled(compile_: Callable[[Any], Any], signature: Any) -> Any:
@@ -159,54 +160,33 @@ def _loaded_or_compiled(compile_: Callable[[Any], Any], signature: Any) -> Any:
         finally:
             if collects:
                 gc.enable()
-            if _pending:
-                path = _pending.pop()
-                if path is not None:
-                    _change_lock(path, 'LOCK_UN')
-                notices.compiling.end()
+            _held.close()
 
 
 def _begin(path: pathlib.Path | None) -> None:
-    _pending.append(path)
     notices.compiling.begin()
+    _held.callback(notices.compiling.end)
     if path is not None:
-        _wait(path)
+        _wait(path.with_suffix('.lock'))
 
 
 def _wait(path: pathlib.Path) -> None:
     """Locks a function, as soon as no other process has the lock."""
     global limit
     until = time.monotonic() + limit
-    while not _change_lock(path, 'LOCK_EX', 'LOCK_NB'):
-        if time.monotonic() >= until:
-            limit = 0.0
+    while True:
+        try:
+            _held.enter_context(files.locked(path, 'compiles it'))
             return
+        except OSError:  # the file cannot be written
+            return
+        except RuntimeError:
+            if time.monotonic() >= until:
+                limit = 0.0
+                return
         with notices.compiling.waiting():
             time.sleep(_TICK)
         interrupts.deliver()
-
-
-def _change_lock(path: pathlib.Path, *operation: str) -> bool:
-    """Locks or unlocks a function; returns whether no other process has the lock, as far as is known."""
-    if files.fcntl is None:
-        return True
-    try:
-        file = _lock_file(path.parent)
-    except OSError:
-        return True
-    flags = sum(getattr(files.fcntl, name) for name in operation)
-    place = int(hashlib.sha256(str(path).encode()).hexdigest()[:10], 16)
-    try:
-        files.fcntl.lockf(file, flags, 1, place)  # a byte stands for the function
-    except OSError as error:  # others than these: the file system has no locks
-        return error.errno not in (errno.EAGAIN, errno.EACCES)
-    return True
-
-
-@functools.cache
-def _lock_file(folder: pathlib.Path) -> BinaryIO:
-    # Closing it would release the locks. Forked processes do not inherit them.
-    return open(folder.parent / 'lock', 'ab')
 
 
 @functools.cache
