@@ -60,6 +60,7 @@ class ViewTest(CommandTest):
     @parameterized.parameters(
         ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
         ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
+        ('no such file', GAPS, '--policy', 'none.npz'),
         ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
     )
