@@ -6,7 +6,7 @@ import pickle
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import composer, mjcf
 from helpers import assert_refused, height_map, surface_velocity, velocity_map
 
@@ -451,7 +451,3 @@ class WorldTest(parameterized.TestCase):
         np.testing.assert_array_equal(picture(*other, 2, 30.0), second)
         # Refilled within an episode, after frames were rendered.
         np.testing.assert_array_equal(picture(*other, 1, -30.0), first)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -2,7 +2,7 @@
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import mjcf
 
 from trl_suite import suite, terrain
@@ -314,7 +314,3 @@ class LongWalkTest(parameterized.TestCase):
                 trajectory.append(environment.step(action).observation['pose'])
             states.append(np.array(trajectory))
         np.testing.assert_array_equal(*states)
-
-
-if __name__ == '__main__':
-    absltest.main()

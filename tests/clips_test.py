@@ -7,7 +7,7 @@ import sys
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 
 from trl_suite import motion
 from trl_suite.motion import quaternion
@@ -235,7 +235,3 @@ class RecipesTest(parameterized.TestCase):
         self.assertBetween(found.force[:, 2].max(), 1.5, 1.85)
         self.assertLess(np.percentile(found.friction, 95), 0.45)
         self.assertLess(np.nanmedian(found.outside), 0.01)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -274,7 +274,3 @@ def entered(folder):
                 del point['seconds']
         found[path.name] = content
     return found
-
-
-if __name__ == '__main__':
-    absltest.main()

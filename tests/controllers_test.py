@@ -4,7 +4,7 @@ import functools
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control import mjcf
 from dm_control.locomotion.arenas import floors
 from helpers import assert_refused
@@ -620,7 +620,3 @@ class AloneTest(parameterized.TestCase):
         self.assertLess(down, 60)  # of 1800
         self.assertGreater(world.qpos[0, places[0]], 6.0)
         self.assertLess(abs(world.qpos[0, places[2]]), 1.2)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -3,7 +3,7 @@
 import functools
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import (
     LEFT,
     RIGHT,
@@ -713,7 +713,3 @@ class OptionTest(parameterized.TestCase):
             plans.turn = 1.0
         plans = Plans.parse('plans', {'length': 0.5, 'width': np.array([0, 0.2])})
         self.assertEqual((plans.length, plans.width.high), ((0.5, 0.5), 0.2))
-
-
-if __name__ == '__main__':
-    absltest.main()

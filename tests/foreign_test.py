@@ -7,7 +7,7 @@ import pathlib
 import mujoco
 import numpy as np
 import pytest
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 
 from trl_suite import characters, suite
 
@@ -107,7 +107,3 @@ class ForeignFileTest(parameterized.TestCase):
                 self.assertEqual(least, 0.0)  # it fell
                 return
         self.assertGreater(physics.bind(root).xpos[2], least * begin)
-
-
-if __name__ == '__main__':
-    absltest.main()

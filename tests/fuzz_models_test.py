@@ -17,7 +17,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import trimesh
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from dm_control.mjcf import schema
 
 from trl_suite import characters, suite
@@ -244,7 +244,3 @@ class FuzzTest(parameterized.TestCase):
         for i in range(SLOW):
             with self.subTest(kind=kind, seed=seed + i):
                 check(self.draw(kind, seed + i))
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -4,7 +4,7 @@ import ctypes
 import dataclasses
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import assert_refused, links_on_ground, made
 from imitation_test import PlanarProbe
 
@@ -544,7 +544,3 @@ class BatchTest(parameterized.TestCase):
         np.testing.assert_array_equal(specs.task.world.time, 0)
         np.testing.assert_array_equal(step.reward, 0)
         np.testing.assert_array_equal(step.info['duration'], 0)
-
-
-if __name__ == '__main__':
-    absltest.main()

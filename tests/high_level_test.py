@@ -8,7 +8,7 @@ import warnings
 from unittest import mock
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import (
     LEFT,
     RIGHT,
@@ -749,7 +749,3 @@ class OptionTest(FolderTest):
         answers.append(np.where(np.arange(4)[:, None] == 2, np.nan, np.zeros((1, 17))))
         third = 'controller crooked returns an action that is not finite for observation 2'
         assert_refused(self, (lambda: environments.step(np.zeros((4, 5))), third))
-
-
-if __name__ == '__main__':
-    absltest.main()

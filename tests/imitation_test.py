@@ -4,7 +4,7 @@ import itertools
 
 import mujoco
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import assert_refused, assert_uniform, flattened, ground, made, put
 
 from trl_suite import motion, suite, terrain
@@ -670,7 +670,3 @@ class OptionTest(parameterized.TestCase):
             (lambda: suite.build('biped3d_mocap', clip=step), 'not looping'),
             *((lambda e=e: e.reset() and e.task.clip_action(0), 'cannot follow a clip open loop') for e in limp),
         )  # fmt: skip
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -542,7 +542,3 @@ class ReaderTest(FolderTest):
         for last in (0, -1, 9):
             clip = self.read({'Frames': [good, good, [last, *good[1:]]]})
             self.assertAlmostEqual(clip.duration, 0.2)
-
-
-if __name__ == '__main__':
-    absltest.main()

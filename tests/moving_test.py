@@ -4,7 +4,7 @@ import pathlib
 import sys
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import FolderTest
 from PIL import Image
 
@@ -75,7 +75,3 @@ class MovingTest(FolderTest):
             moving.save([], self.folder / 'a.webp')
         with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'; expected .webp"):
             moving.save([np.zeros((9, 9, 3), np.uint8)], self.folder / 'a.gif')
-
-
-if __name__ == '__main__':
-    absltest.main()

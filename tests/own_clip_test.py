@@ -10,7 +10,7 @@ import pathlib
 import re
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import FolderTest, assert_refused, write_terrainrl
 from scipy.spatial.transform import Rotation
 
@@ -506,7 +506,3 @@ class ImitationTest(FolderTest):
         self.assertStartsWith(out.getvalue(), 'walk: ')
         self.assertTrue(motion.load(self.folder / 'clip.npz').loop)
         self.assertGreater((self.folder / 'walk.png').stat().st_size, 1000)
-
-
-if __name__ == '__main__':
-    absltest.main()

@@ -6,7 +6,7 @@ import math
 import pickle
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import assert_refused, height_map, surface_velocity, velocity_map
 
 from trl_suite import terrain
@@ -826,7 +826,3 @@ class SurroundingsTest(parameterized.TestCase):
         x, y = np.random.default_rng(0).uniform(-5, 5, (2, 1, 500))
         np.testing.assert_array_equal(found.height(x, y)[0], found.grounds[0].height(x[0], y[0]))
         self.assertLen(found.boxes[0].top, 40)
-
-
-if __name__ == '__main__':
-    absltest.main()

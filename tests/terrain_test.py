@@ -8,7 +8,7 @@ import math
 import pickle
 
 import numpy as np
-from absl.testing import absltest, parameterized
+from absl.testing import parameterized
 from helpers import FolderTest, assert_refused, assert_uniform
 
 from trl_suite import terrain
@@ -631,7 +631,3 @@ class PlanarGroundTest(parameterized.TestCase):
             np.testing.assert_allclose(level, 0, atol=1e-12)
             heights = strip.height(np.arange(begin, begin + 5, 0.01))
             self.assertBetween(np.argmax(heights > 0.01) * 0.01, 2 - 1e-9, 4.05)
-
-
-if __name__ == '__main__':
-    absltest.main()
