@@ -85,8 +85,8 @@ class Bench:
         self.task, self.gait = task, task.gait.parameters
         self.action_offset, self.action_scale = action_offset, REACH * self.gait.search_scale
         # So that actions in [-1, 1] reach every candidate.
-        task.data.options.action_offset[:] = action_offset
-        task.data.options.action_scale[:] = self.action_scale[self.gait.actions]
+        task.data.action_offset[:] = action_offset
+        task.data.action_scale[:] = self.action_scale[self.gait.actions]
         self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
 
     def actions(self, vectors: np.ndarray) -> np.ndarray:
