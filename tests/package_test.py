@@ -117,7 +117,9 @@ class DiscoveryTest(absltest.TestCase):
         result = unittest.TestResult()
         with mock.patch.dict(os.environ):
             del os.environ['PYTEST_CURRENT_TEST']
-            found['imitation_test.ResetTest.test_on_the_ground_and_not_below0'].run(result)  # uses `helpers.made`
+            found['imitation_test.ResetTest.test_on_the_ground_and_not_below0'].run(
+                result
+            )  # uses `helpers.made`
         self.assertEqual((result.testsRun, result.failures, result.errors), (1, [], []))
 
 
