@@ -282,6 +282,21 @@ class PushTest(parameterized.TestCase):
         mass = environment.physics.model.ptr.body_mass[links(environment)].sum() / 2
         np.testing.assert_allclose(total, (-0.5 * mass, 0, 0), rtol=1e-9)
 
+    def test_an_arrow_shows_it(self):
+        """4 mm long per newton; it points at the root's centre of mass, and ends 0.15 m before it."""
+        push = {'force': 100.0, 'duration': 0.2, 'interval': 0.05, 'direction': 0.5}
+        environment = aloft('PD_Biped3D_Imitate-v0', randomize={'push': push})
+        *_, component = environment.task.components
+        self.assertEmpty(component.markers(0))
+        for _ in range(3):
+            environment.step(zeros(environment))
+        [arrow] = component.markers(0)
+        root = environment.task.world.xipos[0, links(environment)[0]]
+        self.assertAlmostEqual(arrow.size[2], 0.4)
+        self.assertAlmostEqual(arrow.yaw, 0.5)
+        expected = 0.55 * np.array([np.cos(0.5), np.sin(0.5)])
+        np.testing.assert_allclose((root - arrow.position)[:2], expected, atol=1e-12)
+
     def test_times_and_forces_are_drawn_from_their_ranges(self):
         push = {'force': (10, 20), 'duration': (0.1, 0.2), 'interval': (0.3, 0.5)}
         environment = made('PD_Biped3D_Imitate-v0', randomize={'push': push}, step_limit=None)
