@@ -9,7 +9,7 @@
     model = SAC('MlpPolicy', envs).learn(10_000)
     policies.save(exported(model, envs.environment), 'sac.npz')
 
-For 'MlpPolicy' of PPO, A2C, SAC, TD3, DDPG and TQC, and observations that are not normalised.
+For 'MlpPolicy' of PPO, A2C, SAC, TD3, DDPG and TQC; `VecNormalize` may scale the observations.
 """
 
 import numpy as np
@@ -28,8 +28,7 @@ def exported(model, environment):
       model: a model of Stable-Baselines3.
       environment: the `VectorEnvironment` that it was trained in, or a similar one.
     """
-    net = model.policy
-    squashed = hasattr(net, 'actor')
+    net, squashed = model.policy, hasattr(model.policy, 'actor')
     parts = (
         net.actor if squashed else torch.nn.Sequential(net.mlp_extractor.policy_net, net.action_net)
     )
@@ -39,18 +38,20 @@ def exported(model, environment):
     ]  # fmt: skip
     weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
     biases = [layer.bias.detach().numpy().copy() for layer in layers]
-    k, a, options = len(weights[0]), len(biases[-1]), {}
+    k, a = len(weights[0]), len(biases[-1])
+    options = {'mean': np.zeros(k), 'std': np.ones(k), 'clip': 1e6}
+    scales = model.get_vec_normalize_env()
+    if scales is not None and scales.norm_obs:
+        std = np.sqrt(scales.obs_rms.var + scales.epsilon)
+        options = {'mean': scales.obs_rms.mean, 'std': std, 'clip': scales.clip_obs}
     if squashed:
         weights[-1], biases[-1] = np.pad(weights[-1], ((0, 0), (1, 0))), np.pad(biases[-1], (1, 0))
-        options = {'choices': np.zeros((1, a)), 'largest_change': np.float32(1)}
+        options |= {'choices': np.zeros((1, a)), 'largest_change': np.float32(1)}
     return policies.Policy(
         id=environment.spec.id,
         blocks=tuple((name, part.stop - part.start) for name, part in environment.blocks.items()),
         actions=environment.action_map.names,
         quantity=environment.action_map.quantity,
-        mean=np.zeros(k),
-        std=np.ones(k),
-        clip=1e6,
         weights=tuple(weights),
         biases=tuple(biases),
         activation='relu' if squashed else 'tanh',

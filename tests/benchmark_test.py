@@ -219,8 +219,13 @@ class ReportCommandTest(CommandTest):
 
 with contextlib.suppress(ImportError):
     sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+    import stable_baselines3
+    import stable_baselines_export
     import stable_baselines_learners
     import td3_learner
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from trl_suite.adapters.stable_baselines import SuiteVecEnv
 
     class StableBaselinesTest(FolderTest):
         @parameterized.parameters(
@@ -236,6 +241,15 @@ with contextlib.suppress(ImportError):
             path = self.folder / 'policy.npz'
             policies.save(policy, path)
             np.testing.assert_array_equal(policies.load(path)(observations), policy(observations))
+
+        def test_an_exported_policy_scales_observations_as_the_library_does(self):
+            scaled = VecNormalize(SuiteVecEnv(ID, 2, seed=0))
+            model = stable_baselines3.PPO('MlpPolicy', scaled, n_steps=16, batch_size=8, seed=0)
+            model.learn(32)
+            policy = stable_baselines_export.exported(model, scaled.venv.environment)
+            observations = np.random.default_rng(0).normal(0, 30, (5, policy.observation_size))
+            expected, _ = model.predict(scaled.normalize_obs(observations), deterministic=True)
+            np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
 
         @parameterized.parameters(stable_baselines_learners.SAC, td3_learner.TD3)
         def test_a_stopped_run_resumes_exactly(self, kind):
