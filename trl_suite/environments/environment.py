@@ -121,7 +121,7 @@ class Core:
             work(ids)
 
     def begin(self, ids: np.ndarray) -> None:
-        """Begins episodes in some simulations."""
+        """Begins episodes in some simulations of a vector environment."""
         if len(ids):
             self.task.begin(ids, [self.random[env_id] for env_id in ids.tolist()])
             self.restart(ids)

@@ -62,14 +62,15 @@ class Task(composer.Task):
     for the others. A step consists of
 
     1. `apply_action`: clips the actions, sets the controls, and moves ground windows if necessary;
+       or, where a controller drives the joints, sets the plan or the gait that it follows;
     2. `simulate`: advances the physics;
     3. `finish_step`: checks for divergence, measures the body, updates the clock, and computes
        reward, failure and observation, in this order.
 
     Several threads call `reset` and `step`, each for some of the simulations. A call may change
     only the simulations that it is given. The composer hooks below call the same methods for one
-    simulation, so that a plain `composer.Environment` can run the task. Exceptions are tasks whose
-    steps vary in duration; these override `simulate`.
+    simulation, so that a plain `composer.Environment` can run the task, unless its steps vary in
+    duration; such a task overrides `simulate`.
 
     Attributes:
       world: the simulations; set by `bind`.

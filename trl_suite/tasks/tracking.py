@@ -344,7 +344,7 @@ class TrackingTask(BodyTask):
         if self.mirrored:
             reflect_all(env_ids, action, self._view_pack)
             action = self._view.action
-        self.body.control(env_ids, action)
+        super().apply_action(action, env_ids)
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
