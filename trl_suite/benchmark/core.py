@@ -21,7 +21,7 @@ _ROWS = {
     'PD_Biped2D_Gaps_Terrain-v0': 'target angles; steps must land beyond gaps',
     'PD_Dog2D_Mixed_Terrain-v0': 'target angles; steps, gaps and walls in turn',
     'PD_Raptor2D_Slopes_Terrain-v0': 'target angles; slopes without level ground',
-    'MTU_Biped2D_LLC_Imitate_Flat-v0': 'activations of muscles',
+    'MTU_Biped2D_LLC_Imitate_Flat-v0': 'excitations of muscles',
     'Torque_Dog2D_LLC_Imitate_Flat-v0': 'torques of a body with many joints',
     'PD_Biped3D_Imitate-Stairs_Terrain-v0': 'balance in 3D; stairs seen as a map of heights',
     'FSM_Hopper2D_Terrain_Gaps-v0': 'one action per hop; gaps',
