@@ -90,7 +90,7 @@ class PlanTask(Planned, TrackingTask):
     state: FootstepState
     goal_given = False
     _grace_steps = 0  # control steps after a sharp turn in which landing errors do not count
-    _drawn_plans: Plans  # how plans are drawn; for planar characters without what they have not
+    _drawn_plans: Plans  # how plans are drawn; planar ones have no width and no turns
 
     def _begin_plan(self, i: int) -> None:
         """Draws the first plan of an episode, and its first goal; the stance foot is known."""
