@@ -162,6 +162,21 @@ class GeometryTest(parameterized.TestCase):
                 gaps += 1
         self.assertGreater(gaps, 5)
 
+    @parameterized.parameters(
+        'cliffs_rugged', 'walls', 'tight_gaps', 'mixed', 'slopes_mixed', 'slopes_mixed_humanoid',
+        'slopes_narrow_gaps',
+    )  # fmt: skip
+    def test_ramps(self, source):
+        """No box protrudes from a ramp, and none cuts off its ends."""
+        for seed, length in ((0, 0.1), (1, 0.1), (2, 0.3)):
+            ground = Stage(terrain.load(source).with_faces(length), seed)
+            self.assertEqual(len(faces_of(ground.strip, -5, 17)[0]), 0)
+            xs = np.random.default_rng(1).uniform(-BEHIND, AHEAD, 700)
+            errors = ground.heights(xs) - ground.strip.height(xs)
+            self.assertLess(np.abs(errors).max(), 0.015)
+            self.assertLess(np.sqrt(np.mean(errors**2)), 0.002)
+            self.assertLess(ground.model.geom_pos[-1, 2], -50)  # the pool suffices
+
 
 class PoolTest(parameterized.TestCase):
     """The pool of boxes holds every window, at full resolution."""

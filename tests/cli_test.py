@@ -526,7 +526,10 @@ class TerrainTest(CommandTest):
         self.output('terrain', 'gaps', '--draws', '1', '--length', '12', '--output', 'b.png')
         one, three = iio.imread('b.png'), iio.imread('terrain_gaps.png')
         self.assertLess(one.shape[0], three.shape[0])
-        self.assert_only('terrain_gaps.png', 'b.png')
+        ramps = ('--draws', '1', '--length', '12', '--face-length', '0.5', '--output', 'c.png')
+        self.output('terrain', 'gaps', *ramps)
+        self.assertTrue((iio.imread('c.png') != one).any())
+        self.assert_only('terrain_gaps.png', 'b.png', 'c.png')
 
     def test_a_policy_file(self):
         (self.folder / 'own').mkdir()
@@ -540,6 +543,7 @@ class TerrainTest(CommandTest):
         ('no such file', 'none.json'),
         ('length is 0.0', 'gaps', '--length', '0'),
         ('seed is -2', 'gaps', '--seed', '-2'),
+        ('FaceLength is -1', 'gaps', '--face-length', '-1'),
         ("unknown suffix '.pdf'; expected .*png or .obj", 'gaps', '--output', 'a.pdf'),
         ('length is 4000', 'hills3d', '--length', '4000', '--output', 'a.obj'),
     )

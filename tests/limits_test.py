@@ -125,7 +125,7 @@ class LimitsTest(FolderTest):
     @parameterized.parameters(
         *((lambda v, name=name: suite.make(IDS[0], {name: v}), name) for name in (
             'action_scale', 'terrain_level', 'start_phase', 'start_noise', 'time_limit', 'step_limit',
-            'substeps',
+            'substeps', 'face_length',
         )),
         (lambda v: suite.make(IDS[0], {'start_phase': [[0, v]]}), 'start_phase'),
         (lambda v: suite.make(IDS[0], {'sensors': {'noise': v}}), 'noise'),

@@ -121,6 +121,7 @@ VARIANTS = (
     (IMITATE.format(''), {'action_offset': 'original'}),
     (SOCCER, {'interface': 'frame'}),
     (MOVERS, {'interface': 'frame', 'terrain_observation': ('height', 'velocity')}),
+    *((id_, {'face_length': 0.1}) for id_ in (GAPS, 'FSM_Goat2D_Terrain_Variable_Steps-v0')),
     (DOG, {'levels': (0, 1000)}), (GAITS[0], {'levels': (0, 1000)}),
     *((id_, {'interface': 'base_action', 'start_noise': 0.02}) for id_ in RUNNERS),
     *((id_, WORLD) for id_ in (HILLS, MOVERS, SOCCER)),

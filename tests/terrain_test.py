@@ -94,6 +94,55 @@ class ProcessTest(parameterized.TestCase):
         np.testing.assert_array_equal(np.flatnonzero(profile.vertical), [20, 41, 62, 83])
 
     @parameterized.parameters(
+        # Per feature, x and height of where the ground bends, as with vertices 0.1 m apart.
+        ('gaps', [1, 1.1, 1.4, 1.5], [0, -2, -2, 0],
+         {'GapSpacing': 1, 'GapW': 0.4, 'GapH': -2}),
+        ('walls', [1, 1.1, 1.2, 1.3], [0, 0.3, 0.3, 0],
+         {'WallSpacing': 1, 'WallW': 0.2, 'WallH': 0.3}),
+        ('walls', [1, 1.1, 1.2], [0, 0.3, 0],
+         {'WallSpacing': 1, 'WallW': 0.05, 'WallH': 0.3}),
+        ('steps', [0.5, 0.6], [0, 0.1], {'StepSpacing': 0.5, 'StepH0': 0.1, 'StepH1': 0}),
+        ('cliffs', [0.5, 0.6], [0, -0.3], {'CliffSpacing': 0.5, 'CliffH0': 0, 'CliffH1': -0.3}),
+        ('narrow_gaps', [1, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7], [0, -1, -1, 0, 0, -1, -1, 0],
+         {'NarrowGapSpacing': 1, 'NarrowGapDist': 0.1, 'NarrowGapW': 0.2, 'NarrowGapDepth': -1,
+          'NarrowGapCount': 2}),
+    )  # fmt: skip
+    def test_ramps(self, kind, x, heights, features):
+        ranges = {f'{name}{end}': v for name, v in features.items() for end in ('Min', 'Max')}
+        ground = terrain.load(planar(kind, **ranges)).with_faces(0.1)
+        xs = np.append(0, np.add.outer(x[-1] * np.arange(5), x))  # five features, from 1 m on
+        zs = np.append(0, np.add.outer(heights[-1] * np.arange(5), heights))
+        at = np.random.default_rng(0).uniform(0, xs[-1], 500)
+        strip = terrain.PlanarGround(ground, 0)
+        np.testing.assert_allclose(strip.height(1 + at), np.interp(at, xs, zs), atol=1e-9)
+        self.assertFalse(strip.window(40, 400)[1].any())
+        # One cell is as steep as in the original; 0 is vertical; treads keep their lengths.
+        for length, count in ((0.0, 1), (0.02, 1), (0.3, 12)):
+            profile = draw(ground.with_faces(length))
+            bent = np.flatnonzero(rounded(np.diff(profile.heights, n=2, prepend=[0, 0])))
+            self.assertEqual(bent[0], round(x[0] / 0.025))
+            self.assertEqual(bent[1] - bent[0], count)
+            self.assertEqual(profile.vertical.any(), length == 0)
+
+    def test_ledges_of_ramps(self):
+        """The ledges of a cliff keep their length."""
+        rise = rounded(np.diff(draw(terrain.load('cliffs_rugged').with_faces(0.1), 200.0).heights))
+        begins = np.flatnonzero((rise[1:] > 0) & (rise[:-1] == 0)) + 1
+        for i in begins[:-1]:
+            np.testing.assert_array_equal(rise[i : i + 4], rise[i])
+            np.testing.assert_array_equal(rise[i + 4 : i + 8], 0)
+        self.assertIn(8, np.diff(begins))  # a ramp of 0.1 m and a ledge of 0.1 m
+
+    def test_terrain_without_faces(self):
+        for name in ('flat', 'slopes', 'bumps', 'plane'):
+            self.assertIs(terrain.load(name).with_faces(0.1), terrain.load(name))
+        self.assertIs(terrain.load('gaps').with_faces(None), terrain.load('gaps'))
+        with self.assertRaisesRegex(
+            ValueError, 'gaps: Params.0.: FaceLength is -1; expected .* from 0'
+        ):
+            terrain.load('gaps').with_faces(-1)
+
+    @parameterized.parameters(
         (0.2, 8), (0.3, 12), (0.55, 22), (0.7, 28), (0.1 + 0.2, 12), (0.21, 9), (0.0, 0)
     )
     def test_cells(self, length, count):
@@ -282,7 +331,9 @@ class FileTest(FolderTest):
         for source in (path, str(path), json.loads(PAPER)):
             ground = terrain.load(source)
             self.assertEqual(ground.type, 'var2d_slopes_mixed')
-            self.assertEqual(ground.parameters(), json.loads(PAPER)['Params'][0])
+            self.assertEqual(
+                ground.parameters(), json.loads(PAPER)['Params'][0] | {'FaceLength': 0}
+            )
         preset = terrain.load('slopes_mixed_humanoid')
         self.assertEqual(preset.parameters(), terrain.load(path).parameters())
         self.assertIs(terrain.load(preset), preset)
@@ -312,7 +363,7 @@ class FileTest(FolderTest):
     @parameterized.parameters({}, {'Params': []}, {'Params': [{}]}, {'GroundWidth': 20})
     def test_defaults(self, **content):
         defaults = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
-                    'GapHMin': -2, 'GapHMax': -2}  # fmt: skip
+                    'GapHMin': -2, 'GapHMax': -2, 'FaceLength': 0}  # fmt: skip
         found = terrain.load({'Type': 'var2d_gaps', **content}).parameters()
         self.assertEqual(found, defaults)
         some = terrain.load(planar('gaps', GapWMax=1)).parameters()

@@ -24,6 +24,8 @@ TILTED_THICKNESS = 1.0  # m
 OVERLAP = 0.05  # m; by which tilted pieces are extended below each other at valleys
 LEAN = 0.9  # of the distance to the next face; limit of the overhang of a tilted box's lower end
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
+THINNEST = 0.02  # m; of a tilted box beside a ridge
+KINK = 0.5  # rise per m; change of slope at the ends of a ramp
 EPSILON = 1e-9
 
 
@@ -45,7 +47,11 @@ class Pieces(NamedTuple):
 
 
 def cut(
-    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float = TOLERANCE
+    start: int,
+    heights: np.ndarray,
+    vertical: np.ndarray,
+    tolerance: float = TOLERANCE,
+    kink: float = math.inf,
 ) -> Pieces:
     """Cuts a window of a profile into pieces, each of which becomes a box.
 
@@ -57,10 +63,11 @@ def cut(
       heights: heights of the vertices, m, shape (m,).
       vertical: True where the cell before a vertex is a vertical face, shape (m,).
       tolerance: largest deviation of the profile from a tilted box longer than 0.1 m, m.
+      kink: change of slope at which a piece ends, rise per m; `KINK` if the ground has ramps.
     """
     marks = np.empty((3, len(heights)), bool)
     ends, edges = np.empty((2, len(heights)), int), np.empty((5, len(heights)))
-    _mark(start, heights, vertical, tolerance, marks)
+    _mark(start, heights, vertical, tolerance, kink, marks)
     count, level = _join(start, heights, vertical, marks, ends, edges)
     return Pieces(count, level, ends, edges)
 
@@ -88,7 +95,12 @@ def _is_level(cell: int, heights: np.ndarray, vertical: np.ndarray) -> bool:
 
 @compiled
 def _mark(
-    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float, marks: np.ndarray
+    start: int,
+    heights: np.ndarray,
+    vertical: np.ndarray,
+    tolerance: float,
+    kink: float,
+    marks: np.ndarray,
 ) -> None:
     """Marks the vertices between pieces in marks[0]; other rows of marks, (3, m), are scratch."""
     cuts, mandatory, whole = marks[0], marks[1], marks[2]
@@ -97,6 +109,9 @@ def _mark(
         left, right = _is_level(i, heights, vertical), _is_level(i + 1, heights, vertical)
         before, after = _is_face(i, vertical), _is_face(i + 1, vertical)
         cuts[i] = left != right or before or after or i == 0 or i == count - 1
+        if not cuts[i]:
+            bend = heights[i + 1] - 2 * heights[i] + heights[i - 1]
+            cuts[i] = abs(bend) > kink * SPACING
         any_sloped |= i > 0 and not (left or before)
     if not any_sloped:
         return
@@ -216,9 +231,12 @@ def pose(pieces: Pieces, vertical: np.ndarray, angle: np.ndarray, end: float, bo
         thickness = LEVEL_THICKNESS
         if abs(slope) > EPSILON:
             # The lower end of a tilted box overhangs: to the right where the ground rises, else to
-            # the left. It must not protrude from the next face on that side.
+            # the left. It must not protrude from the next face on that side, nor beyond a ridge.
             room = boxes.half_size[k, 2] if slope > 0 else x0 - left_face
-            thickness = min(TILTED_THICKNESS, LEAN * room / max(abs(sine), EPSILON))
+            steep = max(abs(sine), EPSILON)
+            thickness = min(TILTED_THICKNESS, LEAN * room / steep)
+            room = _room(k, count, thickness * steep, edges)
+            thickness = min(thickness, max(THINNEST, LEAN * room / steep))
         boxes.position[k, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
         boxes.position[k, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine
         boxes.half_size[k, 0] = 0.5 * np.hypot(x1 - x0, z1 - z0)
@@ -228,6 +246,23 @@ def pose(pieces: Pieces, vertical: np.ndarray, angle: np.ndarray, end: float, bo
     for k in range(count, len(boxes.position)):
         boxes.position[k, 0], boxes.position[k, 1], boxes.position[k, 2] = end, 0.0, PARKED
         boxes.half_size[k, 0] = boxes.half_size[k, 1] = boxes.half_size[k, 2] = 0.1
+
+
+@compiled
+def _room(k: int, count: int, overhang: float, edges: np.ndarray) -> float:
+    """Distance from the upper end of a tilted piece to ground that is below the end of its box, m.
+
+    Such ground, beyond a ridge, falls more steeply than the end face of the box, which the box
+    extends by `overhang`, m, to that side. Infinite if there is none.
+    """
+    side = 1 if edges[4, k] > 0 else -1  # of the upper end
+    near, far = (0, 2) if side > 0 else (2, 0)  # ends of the pieces on that side
+    x, z, j = edges[far, k], edges[far + 1, k], k + side
+    while 0 <= j < count and side * (edges[near, j] - x) < overhang:
+        if side * (edges[far, j] - x) < (z - edges[far + 1, j]) * abs(edges[4, k]):
+            return max(0.0, side * (edges[near, j] - x))
+        j += side
+    return math.inf
 
 
 @compiled

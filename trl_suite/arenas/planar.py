@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ class PlanarArena(composer.Arena):
             return  # as on flat ground: boxes need not move
         tolerance = boxes.TOLERANCE
         surface = heights[BEFORE:], vertical[BEFORE:]
-        pieces = boxes.cut(start, *surface, tolerance)
+        pieces = boxes.cut(start, *surface, tolerance, _kink(strip))
         while pieces.number > len(self.boxes):  # a coarser surface is better than one with holes
             tolerance *= 2
             if tolerance > COARSEST:
@@ -140,7 +141,7 @@ class PlanarArena(composer.Arena):
                     f'{(BEHIND + AHEAD) * SPACING:g} m; expected at most {len(self.boxes)}, as '
                     f'estimated from {PROBES} random windows; distribute its features more evenly'
                 )
-            pieces = boxes.cut(start, *surface, tolerance)
+            pieces = boxes.cut(start, *surface, tolerance, _kink(strip))
         end = (start + BEHIND + AHEAD) * SPACING
         boxes.pose(pieces, surface[1], boxes.angles(pieces), end, self._pools[env_id])
         self._world.set_const(env_id, ground_only=True)
@@ -168,6 +169,11 @@ def _heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarWindows, out: np.
             out[k, p] = planar_ground.height(env_ids[k], x[k, p], ground)
 
 
+def _kink(strip: PlanarGround) -> float:
+    """Change of slope at which boxes end, see `boxes.cut`."""
+    return boxes.KINK if strip.parameters.get('FaceLength') else math.inf
+
+
 def _pool_size(terrain: Terrain) -> int:
     """Estimates the number of boxes that a window of a terrain needs, from a few fixed seeds."""
     generator, windows = GENERATORS.get(terrain.type), range(PROBES)
@@ -176,8 +182,7 @@ def _pool_size(terrain: Terrain) -> int:
     most = 0
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for k in windows:
-            window = PlanarGround(terrain, abs(k), terrain_level=terrain_level).window(
-                k * _WINDOW, _WINDOW
-            )
-            most = max(most, boxes.cut(k * _WINDOW, *window).number)
+            strip, start = PlanarGround(terrain, abs(k), terrain_level=terrain_level), k * _WINDOW
+            pieces = boxes.cut(start, *strip.window(start, _WINDOW), kink=_kink(strip))
+            most = max(most, pieces.number)
     return round(SPARE * most) + PROBES

@@ -32,6 +32,8 @@ def declare(commands: Any) -> None:
     command.add_argument(
         '--terrain-level', type=float, default=0.0, help='index of the parameter set'
     )
+    text = 'length of ramps in place of vertical faces, in m'
+    command.add_argument('--face-length', type=float, help=text)
     text = 'write a plot, .png, or a mesh of the first ground, .obj, .glb or .stl'
     add_file(command, '--output', text)
 
@@ -42,16 +44,19 @@ def run(arguments: argparse.Namespace) -> None:
     known = name.name if name.suffix not in ('.json', '.txt') else name.stem
     output = arguments.output or pathlib.Path(f'terrain_{known}.png')
     files.check_path(output, (*rendering.IMAGE_SUFFIXES, *terrain.WRITTEN))
+    source = terrain.load(arguments.terrain).with_faces(arguments.face_length)
     if output.suffix.lower() in terrain.WRITTEN:
-        _write_mesh(arguments, output)
+        _write_mesh(source, arguments, output)
         return
     drawn = arguments.draws, arguments.length, arguments.seed, arguments.terrain_level
-    rendering.plot_terrain(arguments.terrain, output, *drawn)
+    rendering.plot_terrain(source, output, *drawn)
     print(output)
 
 
-def _write_mesh(arguments: argparse.Namespace, output: pathlib.Path) -> None:
-    source, length = terrain.load(arguments.terrain), arguments.length
+def _write_mesh(
+    source: terrain.Terrain, arguments: argparse.Namespace, output: pathlib.Path
+) -> None:
+    length = arguments.length
     if not 0 < length <= LONGEST:
         raise ValueError(f'length is {length}; expected metres in (0, {LONGEST:g}]')
     draw = terrain.SpatialGround if source.spatial else terrain.PlanarGround

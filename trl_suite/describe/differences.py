@@ -56,7 +56,8 @@ _OWN_CLIP = "the clip was made for this suite, with gait and speed close to the 
 _START_PHASE = 'the start phase is drawn uniformly, not in a fixed sequence'
 _LANDING = 'a landing error ends the episode only with the option max_landing_error'
 _FACES = (
-    'faces of gaps, walls and steps are exactly vertical, and every start has flat ground from -1 to 1 m',
+    'faces of gaps, walls and steps are exactly vertical without the option face_length, and every start '
+    'has flat ground from -1 to 1 m',
     lambda spec: spec.terrain != 'flat',
 )
 _CUT = 'episodes are truncated after 256 steps (discount 1)'

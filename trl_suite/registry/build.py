@@ -100,7 +100,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
-    parts = _parts(spec, type_, common.actuators)
+    parts = _parts(spec, type_, common.actuators, getattr(config, 'face_length', None))
     if type_ is not None:
         task = type_.make(parts, config)
     else:
@@ -124,9 +124,12 @@ def _policy(name: str, source: Any) -> Any:
     return policies.reference(find(source).id)
 
 
-def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators) -> Parts:
+def _parts(
+    spec: EnvSpec, type_: TaskType | None, actuators: Actuators, face_length: float | None
+) -> Parts:
     """Makes the parts of the task."""
-    character, ground = character_of(spec), terrains.load(spec.part('terrain'))
+    character = character_of(spec)
+    ground = terrains.load(spec.part('terrain')).with_faces(face_length)
     if ground.spatial != character.spatial:
         presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
         raise ValueError(

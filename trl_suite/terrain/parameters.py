@@ -13,8 +13,8 @@ original. The example printed in the paper is the preset `slopes_mixed_humanoid`
 
 Files of DeepTerrainRL, the predecessor, have types without the prefix, such as `gaps` for
 `var2d_gaps`, and are read as such. Its vertices are 0.1 m apart and slopes change per vertex, so that
-the same numbers give ground that is rougher over short distances here. Bumps and slopes on cliffs,
-which it also had, must be 0.
+the same numbers give ground that is rougher over short distances here; and its faces are ramps of
+0.1 m, as here with `FaceLength` 0.1. Bumps and slopes on cliffs, which it also had, must be 0.
 
 Three-dimensional types are keys of GENERATORS3D; their files look the same. Their height grids have
 vertices 0.2 m apart, so another `VertSpacingX` or `VertSpacingZ` is refused.
@@ -128,6 +128,19 @@ class Terrain:
         if not weight:
             return sets[k]
         return {key: (1 - weight) * a + weight * sets[k + 1][key] for key, a in sets[k].items()}
+
+    def with_faces(self, length: float | None) -> Terrain:
+        """Returns a copy with another `FaceLength`, m; this terrain with None, or without faces.
+
+        Types of your own have faces of another length only if they have this parameter.
+
+        Raises:
+          ValueError: the length is out of range.
+        """
+        if length is None or 'FaceLength' not in self.generator.parameters:
+            return self
+        sets = ({**values, 'FaceLength': length} for values in self.parameter_sets or ({},))
+        return dataclasses.replace(self, parameter_sets=tuple(sets))
 
     def _unknown_parameter(self, key: object) -> str:
         registry = GENERATORS3D if self.spatial else GENERATORS

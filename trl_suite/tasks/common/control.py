@@ -14,8 +14,9 @@ from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.bodies.reference import joint_targets, mean_targets
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
+from trl_suite.terrain.planar.features import MOST_LENGTH
 from trl_suite.util import errors
-from trl_suite.util.options import Config, option
+from trl_suite.util.options import Config, option, within
 
 MOST_SUBSTEPS = 1000  # physics steps per control step
 MOST_SAMPLES = 10_000  # heights observed on a line
@@ -60,6 +61,16 @@ def flat_ground() -> Any:
         "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
         "'upstream', as in the original",
         choices=('intended', 'upstream'),
+    )
+
+
+def faces() -> Any:
+    """Returns the option of how steep faces are, in the plane."""
+    return option(
+        None,
+        'length of the ramps in place of vertical faces of steps, walls and gaps; by default the '
+        "terrain's FaceLength, which is 0 in all presets",
+        **within(0, MOST_LENGTH, 'm'),
     )
 
 
@@ -117,6 +128,7 @@ class PlanarConfig(TrackingConfig):
     )
     action_scale: float | None = joint_angle('; by default 1.5')
     spawn: str = flat_ground()
+    face_length: float | None = faces()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
-from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, flat_ground
+from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, faces, flat_ground
 from trl_suite.tasks.gait import rules
 from trl_suite.tasks.rewards import terms_data
 from trl_suite.tasks.task import Task
@@ -57,6 +57,7 @@ class GaitConfig(GroundConfig):
         at_most=MOST_SUBSTEPS,
     )
     spawn: str = flat_ground()
+    face_length: float | None = faces()
     start_noise: float = option(
         0.0,
         'standard deviation of the noise on joint angles at the start; that on joint rates (rad/s) and '

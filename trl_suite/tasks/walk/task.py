@@ -20,6 +20,7 @@ from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.common.control import (
     GroundConfig,
+    faces,
     height_map,
     joint_angle,
     physics_steps,
@@ -99,6 +100,7 @@ class PlanarWalkConfig(WalkConfig):
     """Options of a planar walk."""
 
     terrain_observation: int = planar_heights()
+    face_length: float | None = faces()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

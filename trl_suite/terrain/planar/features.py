@@ -7,6 +7,10 @@ The features of the original consist of two primitives:
   and 0.225 m at its foot. The level of the ground is unchanged.
 * a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
 
+Faces are vertical. With a `FaceLength` they are ramps, as in DeepTerrainRL, whose vertices are 0.1 m
+apart: the ground ascends or descends over the first vertices at the new level, which are as many or
+more.
+
 Their random processes are those of its terrain generator (Terrain RL Simulator, 2018): equal in
 distribution, not draw by draw.
 """
@@ -64,6 +68,7 @@ CLIFFS = {
     **_counts(CliffMiniCountMax=0),
 }
 BUMPS = _heights(BumpHMin=0, BumpHMax=0.03)
+FACES = _lengths(FaceLength=0)
 SLOPES = _slopes(SlopeDeltaRange=0.25, SlopeDeltaMin=-0.35, SlopeDeltaMax=0.35)
 
 # Features: each function draws one and writes it as runs of equal height, (number of vertices,
@@ -197,9 +202,11 @@ def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, run
 
 @compiled
 def _draw_features(
-    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, runs: Runs
+    kind: int, face: int, missing: int, number: int, parameters: np.ndarray, bits: int, runs: Runs
 ) -> tuple[int, int]:
     """Draws features until no vertices are missing, or the arrays are full.
+
+    Runs that begin with a face have at least its number of cells, `face`.
 
     Returns:
       The number of runs, and the number of vertices that are still missing.
@@ -210,22 +217,30 @@ def _draw_features(
         before, number = number, _draw_feature(kind, number, parameters, bits, runs)
         for k in range(before, number):
             levels[k] += base
+            if counts[k] > 0 and levels[k] != (levels[k - 1] if k else 0.0):
+                counts[k] = max(counts[k], face)
             missing -= counts[k]
         base = levels[number - 1]
     return number, missing
 
 
 @compiled
-def _spread(
-    number: int, counts: np.ndarray, levels: np.ndarray, heights: np.ndarray, vertical: np.ndarray
-) -> None:
-    """Writes the vertices of runs; where a run begins at another height, the cell is vertical."""
+def _spread(number: int, face: int, runs: Runs, heights: np.ndarray, vertical: np.ndarray) -> None:
+    """Writes the vertices of runs.
+
+    One that begins at another height begins with a ramp of `face` cells, or a vertical cell if
+    that is 0.
+    """
+    counts, levels = runs
     i, before = 0, 0.0
     for k in range(number):
         for j in range(i, i + counts[k]):
             heights[j], vertical[j] = levels[k], False
-        if i < len(vertical):  # a run may have no vertices
-            vertical[i] = levels[k] != before
+        if levels[k] != before and i < len(vertical):  # a run may have no vertices
+            vertical[i] = face == 0
+            foot = heights[i - 1] if i else 0.0
+            for j in range(min(face - 1, counts[k])):
+                heights[i + j] = foot + (levels[k] - foot) * ((j + 1) / face)
         i, before = i + counts[k], levels[k]
 
 
@@ -233,15 +248,16 @@ def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Gen
     """Repeats a feature until the length is reached; every feature has at least one vertex."""
     wanted = missing = cells(length)
     values = np.array([parameters[name] for name in _NAMES[kind]], float)
+    face = cells(min(max(0.0, parameters['FaceLength']), MOST_LENGTH))
     bits, number = random.address(rng), 0
     runs = Runs(np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing))
     while True:
-        number, missing = _draw_features(kind, missing, number, values, bits, runs)
+        number, missing = _draw_features(kind, face, missing, number, values, bits, runs)
         if missing <= 0:
             break
         runs = Runs(*(np.resize(array, 2 * len(array)) for array in runs))
     heights, vertical = np.empty(wanted - missing), np.empty(wanted - missing, bool)
-    _spread(number, *runs, heights, vertical)
+    _spread(number, face, runs, heights, vertical)
     return Profile(heights, vertical)
 
 
@@ -302,7 +318,7 @@ def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> P
     return _sloped(flat(parameters, length, rng), parameters, rng)
 
 
-@register('var2d_cliffs', CLIFFS)
+@register('var2d_cliffs', {**CLIFFS, **FACES})
 def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Tall risers broken by ledges."""
     return _repeat(_CLIFF, parameters, length, rng)
@@ -318,8 +334,8 @@ def _register_feature(name: str, kind: int, own: Mapping[str, Parameter], words:
         return _sloped(level(parameters, length, rng), parameters, rng)
 
     level.__doc__, rolling.__doc__ = f'{words} on level ground.', f'{words} on rolling ground.'
-    register(f'var2d_{name}', own)(level)
-    register(f'var2d_slopes_{name}', {**own, **SLOPES})(rolling)
+    register(f'var2d_{name}', {**own, **FACES})(level)
+    register(f'var2d_slopes_{name}', {**own, **FACES, **SLOPES})(rolling)
 
 
 _register_feature('gaps', _GAP, GAPS, 'Gaps')
