@@ -135,7 +135,7 @@ class ParametersTest(parameterized.TestCase):
 @functools.lru_cache(1)
 def pack(gait):
     """Returns the data of a gait for compiled functions."""
-    return packed(gait.rules)
+    return packed(gait.data)
 
 
 def begin(gait):
@@ -155,7 +155,7 @@ def torques(gait):
     """Returns the torques of the next control step, (n, J)."""
     for i in range(gait.world.n):
         gaits.act(i, pack(gait))
-    return gait.rules.scratch.torque.copy()
+    return gait.data.scratch.torque.copy()
 
 
 def advance(gait):
@@ -174,14 +174,14 @@ class Rig:
         environments.reset()
         task = environments.task
         self.character, self.gait, self.world = task.character, task.gait, task.world
-        self.env_ids, self.rules = self.world.all_ids, self.gait.rules
+        self.env_ids = self.world.all_ids
         self.joints = list(self.character.spec.joints)
         self.touches(())
         begin(self.gait)
 
     @property
     def positions(self):
-        return self.world.qpos[:, self.rules.skeleton.qpos]
+        return self.world.qpos[:, self.gait.data.skeleton.qpos]
 
     def scatter(self, seed=0, speed=5.0):
         """Random poses in the air, at random speeds."""
@@ -196,14 +196,14 @@ class Rig:
         return rng
 
     def put(self, q, v):
-        self.world.qpos[self.env_ids[:, None], self.rules.skeleton.qpos] = q
-        self.world.qvel[self.env_ids[:, None], self.rules.skeleton.dof] = v
+        self.world.qpos[self.env_ids[:, None], self.gait.data.skeleton.qpos] = q
+        self.world.qvel[self.env_ids[:, None], self.gait.data.skeleton.dof] = v
         self.world.forward(self.env_ids)
 
     def touches(self, links):
         """Overrides contacts until the next step: names of links, or (n, L) bool."""
         on = np.isin(self.character.spec.links, links) if isinstance(links, tuple) else links
-        first = self.rules.machine.contact
+        first = self.gait.data.machine.contact
         self.world.sensordata.base[:, first : first + len(self.character.spec.links)] = on
 
     def data(self, env_id=0):
@@ -226,7 +226,7 @@ class Rig:
 def enter(rig):
     """Calls the state entry of the current states of all machines."""
     for env_id in rig.env_ids:
-        gaits.enter(env_id, rig.rules)
+        gaits.enter(env_id, rig.gait.data)
 
 
 def jacobian(model, data, columns, body, point):
@@ -257,7 +257,7 @@ def dense_pd(rig, env_id, off=()):
     q, v = data.qpos[columns], data.qvel[columns]
     target = np.zeros(len(q))
     target[3:] = rig.gait.state.target[env_id]
-    for hip in rig.rules.machine.legs[:, 0]:
+    for hip in rig.gait.data.machine.legs[:, 0]:
         dof, name = 3 + hip, rig.joints[hip]
         angle = world_angle(data, model.body(f'{rig.name}/{name}').id)
         target[dof] -= angle - q[dof]
@@ -278,13 +278,13 @@ class LawTest(parameterized.TestCase):
         rig = Rig(name, 3)
         rng = rig.scatter(5)
         gait = rig.gait
-        targets, torque = gait.state.target, rig.rules.scratch.torque
+        targets, torque = gait.state.target, rig.gait.data.scratch.torque
         targets[...] = rng.uniform(-4, 4, targets.shape)
         count = len(rig.joints)
         for env_id in rig.env_ids:
-            gaits.stable_pd(env_id, count, rig.rules)
+            gaits.stable_pd(env_id, count, rig.gait.data)
             np.testing.assert_allclose(torque[env_id], dense_pd(rig, env_id), rtol=1e-8, atol=1e-7)
-            gaits.stable_pd(env_id, count - 1, rig.rules)
+            gaits.stable_pd(env_id, count - 1, rig.gait.data)
             expected = dense_pd(rig, env_id, off=(rig.joints[-1],))
             np.testing.assert_allclose(torque[env_id], expected, rtol=1e-8, atol=1e-7)
             self.assertEqual(torque[env_id, -1], 0.0)
@@ -303,13 +303,13 @@ class LawTest(parameterized.TestCase):
 
     def test_world_angles_are_wrapped(self):
         rig = Rig('raptor')
-        q = np.zeros((1, len(rig.rules.skeleton.dof)))
+        q = np.zeros((1, len(rig.gait.data.skeleton.dof)))
         q[0, 1:3] = 3.0, 3.0
         q[0, 3 + rig.joints.index('right_hip')] = 0.5  # 3.5 rad to the world: -2.78
         rig.put(q, np.zeros_like(q))
         rig.gait.state.target[:] = 0.0
         found = np.ones((1, len(rig.joints)))
-        gaits.write_local_targets(0, rig.rules, found)
+        gaits.write_local_targets(0, rig.gait.data, found)
         hip = rig.joints.index('right_hip')
         model, data, _ = rig.data()
         angle = world_angle(data, model.body('raptor/right_hip').id)
@@ -598,7 +598,7 @@ class AloneTest(parameterized.TestCase):
         physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
         world, env_ids = PhysicsWorld(physics, dynamics.FIELDS), np.arange(1)
         gait.bind(world)
-        start, skeleton = gait.parameters.start, gait.rules.skeleton
+        start, skeleton = gait.parameters.start, gait.data.skeleton
         places, rates = skeleton.qpos, skeleton.dof
         world.qpos[0, places[1:3]] = start['height'], start['pitch']
         world.qvel[0, rates[:3]] = start['velocity']
@@ -615,7 +615,7 @@ class AloneTest(parameterized.TestCase):
             if advance(gait)[0]:
                 apply(gait, gait.parameters.action_offset[None])
                 cycles += 1
-            down += (world.sensordata[0, gait.rules.machine.contact + np.array(trunk)] > 0).any()
+            down += (world.sensordata[0, gait.data.machine.contact + np.array(trunk)] > 0).any()
         self.assertBetween(cycles, 5, 9)
         self.assertLess(down, 60)  # of 1800
         self.assertGreater(world.qpos[0, places[0]], 6.0)

@@ -257,7 +257,7 @@ class Adrift:
         self.environment = make(id_, fresh=True)
         self.links = self.environment.task.character.spec.links
         self.environment.physics.model.opt.gravity[:] = 0
-        first = self.environment.task.gait.rules.machine.contact
+        first = self.environment.task.gait.data.machine.contact
         self.sensed = self.environment.physics.data.sensordata[first : first + len(self.links)]
         around_physics(self.environment, self.let_go, self.touch)
 

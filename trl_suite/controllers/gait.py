@@ -3,7 +3,7 @@
     gait = Gait(character, ground_body, root)  # before the model is compiled
     gait.bind(world)
 
-Compiled functions then call those of `trl_suite.controllers.gaits` with `gait.rules`: `begin` after a reset,
+Compiled functions then call those of `trl_suite.controllers.gaits` with `gait.data`: `begin` after a reset,
 `apply` with the parameters of a cycle; in every control step `act`, physics, and `advance`, which returns
 whether the cycle has ended.
 """
@@ -19,7 +19,7 @@ from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import dynamics, parameters
 from trl_suite.controllers.dynamics import Mechanics
-from trl_suite.controllers.gaits import STATES, GaitRules, GaitState, Machine, Scratch
+from trl_suite.controllers.gaits import STATES, GaitData, GaitState, Machine, Scratch
 from trl_suite.controllers.parameters import KINDS, Parameters
 from trl_suite.engine import World
 from trl_suite.util import errors
@@ -35,11 +35,11 @@ class Gait:
       number: joint -> its number.
       link: link -> its number.
       state: state of the machines, after `bind`.
-      rules: data for compiled functions, after `bind`.
+      data: for compiled functions, after `bind`.
     """
 
     state: GaitState
-    rules: GaitRules
+    data: GaitData
 
     def __init__(
         self, character: Character, ground_body: str, root: Any, gait: Parameters | None = None
@@ -111,7 +111,7 @@ class Gait:
         scratch = allocated(Scratch, n, **rows)
         physics = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
         mechanics = Mechanics(*(getattr(world, name) for name in Mechanics._fields))
-        self.rules = GaitRules(skeleton, physics, mechanics, machine, self.state, scratch)
+        self.data = GaitData(skeleton, physics, mechanics, machine, self.state, scratch)
 
     def _places(self, legs: np.ndarray) -> np.ndarray:
         """Returns `Machine.place`, the parameter of a state for the target of each joint."""

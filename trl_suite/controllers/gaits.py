@@ -116,7 +116,7 @@ class Scratch(NamedTuple):
     support: np.ndarray
 
 
-class GaitRules(NamedTuple):
+class GaitData(NamedTuple):
     """Data for the compiled functions of gaits."""
 
     skeleton: Skeleton
@@ -128,20 +128,20 @@ class GaitRules(NamedTuple):
 
 
 @compiled_inline
-def touches(i: int, link: int, gait: GaitRules) -> bool:
+def touches(i: int, link: int, gait: GaitData) -> bool:
     """Returns whether a link touches the ground."""
     return gait.physics.sensordata[i, gait.machine.contact + link] > 0.0
 
 
 @compiled_inline
-def of_state(i: int, k: int, gait: GaitRules) -> float:
+def of_state(i: int, k: int, gait: GaitData) -> float:
     """Returns parameter k of the current state."""
     first = gait.machine.misc + gait.state.number[i] * gait.machine.per_state
     return gait.state.vector[i, first + k]
 
 
 @compiled
-def enter(i: int, gait: GaitRules) -> None:
+def enter(i: int, gait: GaitData) -> None:
     """Sets the joint targets of the current state."""
     machine, state = gait.machine, gait.state
     for k in range(len(machine.kp)):
@@ -160,7 +160,7 @@ def hip_angle(i: int, leg: int, machine: Machine, skeleton: Skeleton, qpos: np.n
 
 
 @compiled
-def write_local_targets(i: int, gait: GaitRules, out: np.ndarray) -> None:
+def write_local_targets(i: int, gait: GaitData, out: np.ndarray) -> None:
     """Writes the targets relative to parent links into out[i], (J,)."""
     machine, skeleton, qpos = gait.machine, gait.skeleton, gait.physics.qpos
     for k in range(len(machine.kp)):
@@ -174,7 +174,7 @@ def write_local_targets(i: int, gait: GaitRules, out: np.ndarray) -> None:
 
 
 @compiled
-def stable_pd(i: int, free: int, gait: GaitRules) -> None:
+def stable_pd(i: int, free: int, gait: GaitData) -> None:
     """Writes the torques of stable PD control, which predicts one control step ahead.
 
     Args:
@@ -204,7 +204,7 @@ def stable_pd(i: int, free: int, gait: GaitRules) -> None:
 
 
 @compiled
-def limit(i: int, gait: GaitRules) -> None:
+def limit(i: int, gait: GaitData) -> None:
     """Clips the torques to their limits."""
     torque, limits = gait.scratch.torque, gait.machine.limits
     for k in range(len(limits)):
@@ -216,7 +216,7 @@ def limit(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def bound_ends(i: int, gait: GaitRules) -> bool:
+def bound_ends(i: int, gait: GaitData) -> bool:
     """Returns whether a state is over: by time, or because the next foot has landed."""
     number = gait.state.number[i]
     if number == 0 or number == 2:
@@ -225,7 +225,7 @@ def bound_ends(i: int, gait: GaitRules) -> bool:
 
 
 @compiled
-def bound_torques(i: int, gait: GaitRules) -> None:
+def bound_torques(i: int, gait: GaitData) -> None:
     """Writes torques: stable PD, swing legs with speed feedback, virtual forces on the ground."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     lead = state.vector[i, 1] * com_speed(i, gait.skeleton, gait.mechanics.M, gait.physics.qvel)
@@ -250,7 +250,7 @@ def bound_torques(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def stand(i: int, gait: GaitRules) -> None:
+def stand(i: int, gait: GaitData) -> None:
     """Writes the Jacobians of the feet; 0 for feet in the air."""
     machine, support = gait.machine, gait.scratch.support
     for leg in range(2):
@@ -265,7 +265,7 @@ def stand(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def add_weight(i: int, gait: GaitRules) -> None:
+def add_weight(i: int, gait: GaitData) -> None:
     """Adds torques that compensate gravity by the feet on the ground."""
     skeleton, scratch = gait.skeleton, gait.scratch
     com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
@@ -293,7 +293,7 @@ def add_weight(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def stride_ends(i: int, gait: GaitRules) -> bool:
+def stride_ends(i: int, gait: GaitData) -> bool:
     """Returns whether a state is over: by time, the last one when the swing foot lands."""
     if gait.state.number[i] < LAST:
         return gait.state.phase[i] >= 1.0
@@ -301,7 +301,7 @@ def stride_ends(i: int, gait: GaitRules) -> bool:
 
 
 @compiled
-def stride_torques(i: int, gait: GaitRules) -> None:
+def stride_torques(i: int, gait: GaitData) -> None:
     """Writes torques: stable PD, balance feedback by the swing hip, root pitch by the stance hip."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     skeleton, physics = gait.skeleton, gait.physics
@@ -330,7 +330,7 @@ DESCENT, DOWN, UP, ASCENT = range(STATES)
 
 
 @compiled
-def hop_advance(i: int, gait: GaitRules) -> bool:
+def hop_advance(i: int, gait: GaitData) -> bool:
     """Advances the hopper's state; returns whether it lands, which ends the cycle."""
     state = gait.state
     landed = touches(i, gait.machine.feet[0], gait)
@@ -352,7 +352,7 @@ def hop_advance(i: int, gait: GaitRules) -> bool:
 
 
 @compiled
-def hop_torques(i: int, gait: GaitRules) -> None:
+def hop_torques(i: int, gait: GaitData) -> None:
     """Writes torques: stable PD; on the ground, root pitch by the hip, weight by the leg."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     skeleton, qpos, qvel = gait.skeleton, gait.physics.qpos, gait.physics.qvel
@@ -372,7 +372,7 @@ def hop_torques(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def apply(i: int, gait: GaitRules) -> None:
+def apply(i: int, gait: GaitData) -> None:
     """Begins a cycle with the parameters in `state.vector`."""
     machine, state = gait.machine, gait.state
     for place in machine.absolute:
@@ -385,7 +385,7 @@ def apply(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def act(i: int, gait: GaitRules) -> None:
+def act(i: int, gait: GaitData) -> None:
     """Writes the torques of the next control step, within limits."""
     if gait.machine.kind == BOUND:
         bound_torques(i, gait)
@@ -396,7 +396,7 @@ def act(i: int, gait: GaitRules) -> None:
 
 
 @compiled
-def advance(i: int, gait: GaitRules) -> bool:
+def advance(i: int, gait: GaitData) -> bool:
     """Advances a state machine after a control step; returns whether its cycle has ended.
 
     A machine whose cycle has ended stays in its last state until `apply`.
@@ -419,7 +419,7 @@ def advance(i: int, gait: GaitRules) -> bool:
 
 
 @compiled
-def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
+def begin(i: int, vector: np.ndarray, gait: GaitData) -> None:
     """Resets a state machine to the start of its first cycle, with parameters (P,)."""
     state = gait.state
     state.stance[i] = 0

@@ -14,7 +14,7 @@ from trl_suite.bodies.planar import breaks_down, has_left, measure, observe_body
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import CONTROL_TIMESTEP, gaits
-from trl_suite.controllers.gaits import GaitRules, touches
+from trl_suite.controllers.gaits import GaitData, touches
 from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
 from trl_suite.tasks.rewards import (
@@ -90,7 +90,7 @@ class GaitTaskState(NamedTuple):
     stumbling: np.ndarray = REAL
 
 
-class GaitData(NamedTuple):
+class GaitTaskData(NamedTuple):
     """Data for the compiled functions of gait tasks.
 
     Attributes:
@@ -112,7 +112,7 @@ class GaitData(NamedTuple):
     """
 
     body: BodyData
-    gait: GaitRules
+    gait: GaitData
     terms: Any
     interruption: np.ndarray
     state: GaitTaskState
@@ -137,7 +137,7 @@ class GaitData(NamedTuple):
 
 
 @compiled
-def set_gait(i: int, data: GaitData) -> None:
+def set_gait(i: int, data: GaitTaskData) -> None:
     """Begins a cycle with the parameters of the current action."""
     action, vector = data.state.action, data.gait.state.vector
     data.state.waiting[i] = False
@@ -157,7 +157,7 @@ def set_gait(i: int, data: GaitData) -> None:
 
 
 @compiled
-def go_on(i: int, watched: bool, data: GaitData) -> int:
+def go_on(i: int, watched: bool, data: GaitTaskData) -> int:
     """Continues a step until it is over or interrupted; returns the reason."""
     state = data.state
     while state.going[i]:
@@ -182,7 +182,7 @@ def go_on(i: int, watched: bool, data: GaitData) -> int:
 
 
 @compiled
-def account(i: int, data: GaitData) -> None:
+def account(i: int, data: GaitTaskData) -> None:
     """Updates times, stumbling and failure after a control step."""
     state = data.state
     state.lasted[i] += 1
@@ -193,7 +193,7 @@ def account(i: int, data: GaitData) -> None:
 
 
 @compiled
-def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
+def any_touches(i: int, links: np.ndarray, gait: GaitData) -> bool:
     """Returns whether any of these links touches the ground."""
     for link in links:
         if touches(i, link, gait):
@@ -202,7 +202,7 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 
 
 @compiled
-def judge(i: int, data: GaitData) -> None:
+def judge(i: int, data: GaitTaskData) -> None:
     """Tests whether the episode has failed."""
     state, ids, physics = data.state, data.body.ids, data.body.physics
     sample_fall(i, any_touches(i, data.fall, data.gait), state.down)
@@ -221,7 +221,7 @@ def judge(i: int, data: GaitData) -> None:
 
 
 @compiled
-def reward(i: int, data: GaitData) -> None:
+def reward(i: int, data: GaitTaskData) -> None:
     """Writes the reward terms, from mean speed and stumbling time of the cycle."""
     state, terms, outcome = data.state, data.terms, data.outcome
     travelled = data.body.physics.subtree_com[i, data.body.ids.links[0], 0] - state.start[i]
@@ -238,7 +238,7 @@ def reward(i: int, data: GaitData) -> None:
 
 
 @compiled
-def observe(i: int, data: GaitData) -> None:
+def observe(i: int, data: GaitTaskData) -> None:
     """Writes the observation, with the stance leg first."""
     ids, physics = data.body.ids, data.body.physics
     measured, observation = data.body.observation, data.outcome.observation
@@ -276,7 +276,7 @@ def observed_blocks(
 
 
 @compiled
-def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitData) -> None:
+def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitTaskData) -> None:
     """Begins steps; an action sets the gait of a cycle that begins with its step."""
     state, root = data.state, data.body.ids.links[0]
     for i in env_ids:
@@ -290,7 +290,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitData) -> None
 
 
 @compiled
-def run(env_ids: np.ndarray, watched: bool, data: GaitData) -> int:
+def run(env_ids: np.ndarray, watched: bool, data: GaitTaskData) -> int:
     """Continues steps; returns how many were interrupted."""
     interrupted = 0
     for i in env_ids:
@@ -300,7 +300,7 @@ def run(env_ids: np.ndarray, watched: bool, data: GaitData) -> int:
 
 
 @compiled
-def finish_steps(env_ids: np.ndarray, data: GaitData) -> None:
+def finish_steps(env_ids: np.ndarray, data: GaitTaskData) -> None:
     """Computes reward, failure and observation of steps that are over."""
     state, outcome = data.state, data.outcome
     for i in env_ids:
@@ -317,7 +317,7 @@ def finish_steps(env_ids: np.ndarray, data: GaitData) -> None:
 
 
 @compiled
-def observe_all(env_ids: np.ndarray, fresh: bool, data: GaitData) -> None:
+def observe_all(env_ids: np.ndarray, fresh: bool, data: GaitTaskData) -> None:
     """Writes observations; if `fresh`, episodes have just begun, as do their gaits."""
     state, ids, qpos = data.state, data.body.ids, data.body.physics.qpos
     for i in env_ids:

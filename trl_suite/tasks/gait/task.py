@@ -154,9 +154,9 @@ class GaitTask(Task):
         parameters, spec = gait.parameters, self.character.spec
         stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
         pitch = parameters.observe_pitch
-        self.data = rules.GaitData(
+        self.data = rules.GaitTaskData(
             body=body.data,
-            gait=gait.rules,
+            gait=gait.data,
             terms=terms_data(self.terms),
             interruption=np.zeros(n, int),
             state=self.state,

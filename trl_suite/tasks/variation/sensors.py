@@ -100,7 +100,7 @@ class SensorState(NamedTuple):
     head: np.ndarray = WHOLE
 
 
-class SensorRules(NamedTuple):
+class SensorData(NamedTuple):
     """Data of the compiled functions of sensors.
 
     Attributes:
@@ -124,9 +124,9 @@ class SensorRules(NamedTuple):
     state: SensorState
 
 
-def rules(
+def sensor_data(
     config: SensorConfig, blocks: Sequence[Block], exact: np.ndarray, long_steps: bool
-) -> SensorRules:
+) -> SensorData:
     """Allocates sensors.
 
     Args:
@@ -167,7 +167,7 @@ def rules(
         history=np.zeros((depth, size)),
         stream=np.zeros(6, np.uint64),
     )
-    return SensorRules(exact, noise, bias, wrong, dropout, shared, delay, state)
+    return SensorData(exact, noise, bias, wrong, dropout, shared, delay, state)
 
 
 def check(config: SensorConfig, blocks: Sequence[Block]) -> None:
@@ -215,16 +215,16 @@ def _of(given: Any, name: str, default: Any, flags: bool) -> Any:
 
 
 @compiled
-def begin(i: int, rules: SensorRules) -> None:
+def begin(i: int, data: SensorData) -> None:
     """Draws bias and delay of an episode, and fills the history with the current observation."""
-    state = rules.state
-    for k in range(len(rules.noise)):
-        if rules.shared[0, k]:
+    state = data.state
+    for k in range(len(data.noise)):
+        if data.shared[0, k]:
             state.bias[i, k] = state.bias[i, k - 1]
-        elif rules.bias[k] > 0.0:
-            state.bias[i, k] = rules.bias[k] * standard_normal(i, state.stream)
-        low, high = rules.delay[k, 0], rules.delay[k, 1]
-        if rules.shared[1, k]:
+        elif data.bias[k] > 0.0:
+            state.bias[i, k] = data.bias[k] * standard_normal(i, state.stream)
+        low, high = data.delay[k, 0], data.delay[k, 1]
+        if data.shared[1, k]:
             state.delay[i, k] = state.delay[i, k - 1]
         elif high > low:
             state.delay[i, k] = low + int(random(i, state.stream) * (high - low + 1))
@@ -232,33 +232,33 @@ def begin(i: int, rules: SensorRules) -> None:
             state.delay[i, k] = low
     state.head[i] = 0
     for place in range(state.history.shape[1]):
-        for k in range(len(rules.noise)):
-            state.history[i, place, k] = rules.exact[i, k]
+        for k in range(len(data.noise)):
+            state.history[i, place, k] = data.exact[i, k]
 
 
 @compiled
-def draw(i: int, rules: SensorRules) -> None:
+def draw(i: int, data: SensorData) -> None:
     """Draws the noise and the missing numbers of a step."""
-    state = rules.state
-    for k in range(len(rules.noise)):
-        if rules.noise[k] > 0.0:
-            state.noise[i, k] = rules.noise[k] * standard_normal(i, state.stream)
-        elif rules.wrong[k] > 0.0:
-            state.noise[i, k] = random(i, state.stream) < rules.wrong[k]
-        if rules.dropout[k] > 0.0:
-            state.missing[i, k] = random(i, state.stream) < rules.dropout[k]
+    state = data.state
+    for k in range(len(data.noise)):
+        if data.noise[k] > 0.0:
+            state.noise[i, k] = data.noise[k] * standard_normal(i, state.stream)
+        elif data.wrong[k] > 0.0:
+            state.noise[i, k] = random(i, state.stream) < data.wrong[k]
+        if data.dropout[k] > 0.0:
+            state.missing[i, k] = random(i, state.stream) < data.dropout[k]
 
 
 @compiled
-def observe(i: int, rules: SensorRules) -> None:
+def observe(i: int, data: SensorData) -> None:
     """Writes what is observed."""
-    state, depth = rules.state, rules.state.history.shape[1]
-    for k in range(len(rules.noise)):
-        value = rules.exact[i, k]
+    state, depth = data.state, data.state.history.shape[1]
+    for k in range(len(data.noise)):
+        value = data.exact[i, k]
         if depth > 0:
             state.history[i, state.head[i], k] = value
             value = state.history[i, (state.head[i] - state.delay[i, k]) % depth, k]
-        if rules.wrong[k] > 0.0:
+        if data.wrong[k] > 0.0:
             value = 1.0 - value if state.noise[i, k] > 0.0 else value
         else:
             value += state.bias[i, k] + state.noise[i, k]
@@ -266,16 +266,16 @@ def observe(i: int, rules: SensorRules) -> None:
 
 
 @compiled
-def sense_all(env_ids: np.ndarray, fresh: bool, rules: SensorRules) -> None:
+def sense_all(env_ids: np.ndarray, fresh: bool, data: SensorData) -> None:
     """Writes what is observed after a step, or if `fresh` in new episodes. Takes a pack."""
-    depth = rules.state.history.shape[1]
+    depth = data.state.history.shape[1]
     for i in env_ids:
         if fresh:
-            begin(i, rules)
+            begin(i, data)
         elif depth > 0:
-            rules.state.head[i] = (rules.state.head[i] + 1) % depth
-        draw(i, rules)
-        observe(i, rules)
+            data.state.head[i] = (data.state.head[i] + 1) % depth
+        draw(i, data)
+        observe(i, data)
 
 
 class Sensors(Component):
@@ -298,7 +298,7 @@ class Sensors(Component):
         return {'sensors': (str(self._config.changed), self._config)}
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
-        data = rules(self._config, self._observed, outcome.observation, self.task.steps_vary)
+        data = sensor_data(self._config, self._observed, outcome.observation, self.task.steps_vary)
         self._pack, self._state = packed(data), data.state
         self.saved = (data.state,)
         self.info_arrays = {'clean_observation': outcome.observation}
