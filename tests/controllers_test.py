@@ -148,7 +148,7 @@ def apply(gait, vectors):
     """Begins cycles of all machines with parameters (n, P)."""
     gait.state.vector[:] = vectors
     for i in range(gait.world.n):
-        gaits.apply(i, pack(gait))
+        gaits.begin_cycle(i, pack(gait))
 
 
 def torques(gait):
@@ -589,7 +589,7 @@ class AloneTest(parameterized.TestCase):
     def test_a_dog_on_a_floor_of_dm_control(self):
         arena, dog = floors.Floor(), characters.make('dog')
         option = arena.mjcf_model.option
-        option.timestep, option.gravity = controllers.CONTROL_TIMESTEP / 2, (0, 0, -9.8)
+        option.timestep, option.gravity = controllers.GAIT_TIMESTEP / 2, (0, 0, -9.8)
         dog.create_root_joints(arena.attach(dog))
         gait = controllers.Gait(dog, 'world', arena.mjcf_model)
         actuation.add(dog, 'torque', option.timestep)

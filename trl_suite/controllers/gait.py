@@ -4,7 +4,7 @@
     gait.bind(world)
 
 Compiled functions then call those of `trl_suite.controllers.gaits` with `gait.data`: `begin` after a reset,
-`apply` with the parameters of a cycle; in every control step `act`, physics, and `advance`, which returns
+`begin_cycle` with the parameters of a cycle; in every control step `act`, physics, and `advance`, which returns
 whether the cycle has ended.
 """
 

@@ -29,7 +29,7 @@ from trl_suite.controllers.dynamics import (
 from trl_suite.controllers.parameters import KINDS
 from trl_suite.util.compiled import compiled, compiled_inline
 
-CONTROL_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate, and characters fall below 300 Hz
+GAIT_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate, and characters fall below 300 Hz
 STATES = 4
 TRANSITION = 0  # index of TransTime, the duration of timed states, in `BOUND` and `STRIDE`
 BOUND, STRIDE, HOP = range(len(KINDS))
@@ -193,18 +193,18 @@ def stable_pd(i: int, free: int, gait: GaitData) -> None:
     for k in range(3, size):
         joint = k - 3
         kp, kd, v = machine.kp[joint], machine.kd[joint], qvel[i, skeleton.dof[k]]
-        matrix[i, k, k] += CONTROL_TIMESTEP * kd
-        error = -qpos[i, skeleton.qpos[k]] - CONTROL_TIMESTEP * v + torque[i, joint]
+        matrix[i, k, k] += GAIT_TIMESTEP * kd
+        error = -qpos[i, skeleton.qpos[k]] - GAIT_TIMESTEP * v + torque[i, joint]
         torque[i, joint] = 0.0 if joint == free else kp * error - kd * v
         vector[i, k] += torque[i, joint]
     solve(i, size, matrix, vector)
     for joint in range(size - 3):
         if joint != free:
-            torque[i, joint] -= machine.kd[joint] * CONTROL_TIMESTEP * vector[i, 3 + joint]
+            torque[i, joint] -= machine.kd[joint] * GAIT_TIMESTEP * vector[i, 3 + joint]
 
 
 @compiled
-def limit(i: int, gait: GaitData) -> None:
+def clip_torques(i: int, gait: GaitData) -> None:
     """Clips the torques to their limits."""
     torque, limits = gait.scratch.torque, gait.machine.limits
     for k in range(len(limits)):
@@ -235,7 +235,7 @@ def bound_torques(i: int, gait: GaitData) -> None:
             state.target[i, hip] = of_state(i, machine.place[0, hip], gait) + lead
     stable_pd(i, len(machine.kp), gait)
     if touches(i, machine.feet[0], gait) or touches(i, machine.feet[1], gait):
-        stand(i, gait)
+        write_foot_jacobians(i, gait)
         if machine.holds_weight:
             add_weight(i, gait)
         # A force on the body is the opposite force on the ground, of the hind or the fore foot
@@ -246,11 +246,11 @@ def bound_torques(i: int, gait: GaitData) -> None:
         for joint in machine.legs[leg]:
             k = 3 + joint
             torque[i, joint] -= ahead * support[i, 2 * leg, k] + up * support[i, 2 * leg + 1, k]
-    limit(i, gait)
+    clip_torques(i, gait)
 
 
 @compiled
-def stand(i: int, gait: GaitData) -> None:
+def write_foot_jacobians(i: int, gait: GaitData) -> None:
     """Writes the Jacobians of the feet; 0 for feet in the air."""
     machine, support = gait.machine, gait.scratch.support
     for leg in range(2):
@@ -321,7 +321,7 @@ def stride_torques(i: int, gait: GaitData) -> None:
         pitch, rate = physics.qpos[i, skeleton.qpos[2]], physics.qvel[i, skeleton.dof[2]]
         upright = machine.kp[hip] * (of_state(i, 0, gait) - pitch) - machine.kd[hip] * rate
         torque[i, hip] -= torque[i, swing_hip] + upright
-    limit(i, gait)
+    clip_torques(i, gait)
 
 
 # Hop. States: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter:
@@ -365,14 +365,14 @@ def hop_torques(i: int, gait: GaitData) -> None:
     if touches(i, machine.feet[0], gait):
         thigh = hip_angle(i, 0, machine, skeleton, qpos) + qpos[i, skeleton.qpos[3 + hip]]
         torque[i, leg] += machine.lift * math.cos(thigh)
-    limit(i, gait)
+    clip_torques(i, gait)
 
 
 # Any gait.
 
 
 @compiled
-def apply(i: int, gait: GaitData) -> None:
+def begin_cycle(i: int, gait: GaitData) -> None:
     """Begins a cycle with the parameters in `state.vector`."""
     machine, state = gait.machine, gait.state
     for place in machine.absolute:
@@ -399,12 +399,12 @@ def act(i: int, gait: GaitData) -> None:
 def advance(i: int, gait: GaitData) -> bool:
     """Advances a state machine after a control step; returns whether its cycle has ended.
 
-    A machine whose cycle has ended stays in its last state until `apply`.
+    A machine whose cycle has ended stays in its last state until `begin_cycle`.
     """
     machine, state = gait.machine, gait.state
     if machine.kind == HOP:
         return hop_advance(i, gait)
-    state.phase[i] += CONTROL_TIMESTEP / state.vector[i, TRANSITION]
+    state.phase[i] += GAIT_TIMESTEP / state.vector[i, TRANSITION]
     leaving = bound_ends(i, gait) if machine.kind == BOUND else stride_ends(i, gait)
     if not leaving:
         return False
@@ -428,5 +428,6 @@ def begin(i: int, vector: np.ndarray, gait: GaitData) -> None:
         state.target[i, k] = gait.machine.rest[k]
     for k in range(len(vector)):
         state.vector[i, k] = vector[k]
-    apply(i, gait)
-    state.airborne[i] = True  # `apply` has cleared it; the first action must begin in the air, too
+    begin_cycle(i, gait)
+    # `begin_cycle` has cleared it; the first action must begin in the air, too.
+    state.airborne[i] = True

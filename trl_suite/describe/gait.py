@@ -125,7 +125,7 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
 
 def time(spec: EnvSpec, task: Any) -> Section:
     """Returns rates, and the duration of a step and an episode."""
-    control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
+    control, physics = 1 / gait.GAIT_TIMESTEP, 1 / task.physics_timestep
     step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * gait_rules.FRAME:.3g} s'
     if task.interface == 'base_action':
         step = f'{gait_rules.FRAME:.3g} s'

@@ -13,7 +13,7 @@ from trl_suite.bodies.body import BodyData
 from trl_suite.bodies.planar import breaks_down, has_left, measure, observe_body
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
-from trl_suite.controllers import CONTROL_TIMESTEP, gaits
+from trl_suite.controllers import GAIT_TIMESTEP, gaits
 from trl_suite.controllers.gaits import GaitData, touches
 from trl_suite.controllers.parameters import Parameters
 from trl_suite.engine import native
@@ -39,7 +39,7 @@ INTERFACES = ('parameters', 'base_action')
 SAMPLE = 0.1  # s
 TURNED = 0.8 * np.pi  # rad; largest pitch
 PATIENCE, PROGRESS = 5.0, 0.5  # s, m; least distance of the root in a time
-MAX_JOINT_SPEED = 1000.0  # rad/s; high, since these joints have no damping
+MAX_UNDAMPED_SPEED = 1000.0  # rad/s; joints of gaits have no damping, and turn faster than others
 
 STUMBLE_SHARPNESS = 10.0
 TERMS = (  # of the reward of a cycle; weights are those of the character
@@ -53,9 +53,9 @@ TERMS = (  # of the reward of a cycle; weights are those of the character
     ),
 )  # fmt: skip
 
-_FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
-_SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
-_PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
+_FRAME_STEPS = round(FRAME / GAIT_TIMESTEP)
+_SAMPLE_STEPS = round(SAMPLE / GAIT_TIMESTEP)
+_PATIENCE_STEPS = round(PATIENCE / GAIT_TIMESTEP)
 OVER, GROUND, LOOK = range(3)  # why `go_on` returns: the step is over, the ground, or `watch`
 
 
@@ -153,7 +153,7 @@ def set_gait(i: int, data: GaitTaskData) -> None:
                 choice = k
         for k in range(len(data.action_offset)):
             vector[i, k] = data.base_actions[choice, k]
-    gaits.apply(i, data.gait)
+    gaits.begin_cycle(i, data.gait)
 
 
 @compiled
@@ -215,7 +215,7 @@ def judge(i: int, data: GaitTaskData) -> None:
         moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
         state.stuck[i] = moved < PROGRESS
         state.milestone[i, 0], state.milestone[i, 1] = x, z
-    diverged = breaks_down(i, MAX_JOINT_SPEED, data.body)
+    diverged = breaks_down(i, MAX_UNDAMPED_SPEED, data.body)
     data.outcome.diverged[i] = diverged  # keeps the last observation
     data.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
 
@@ -225,7 +225,7 @@ def reward(i: int, data: GaitTaskData) -> None:
     """Writes the reward terms, from mean speed and stumbling time of the cycle."""
     state, terms, outcome = data.state, data.terms, data.outcome
     travelled = data.body.physics.subtree_com[i, data.body.ids.links[0], 0] - state.start[i]
-    speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
+    speed = travelled / (GAIT_TIMESTEP * state.lasted[i])
     off = speed - data.target_speed
     share = state.stumbled[i] / state.lasted[i]
     if speed < 0.0 and not data.backward_reward:
@@ -304,8 +304,8 @@ def finish_steps(env_ids: np.ndarray, data: GaitTaskData) -> None:
     """Computes reward, failure and observation of steps that are over."""
     state, outcome = data.state, data.outcome
     for i in env_ids:
-        state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
-        state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
+        state.duration[i] = GAIT_TIMESTEP * state.lasted[i]
+        state.stumbling[i] = GAIT_TIMESTEP * state.stumbled[i]
         outcome.diverged[i] |= breaks_down(i, math.inf, data.body)
         failed = outcome.failed[i] or outcome.diverged[i]
         if outcome.diverged[i]:

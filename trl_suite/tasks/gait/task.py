@@ -20,7 +20,7 @@ from trl_suite.bodies.planar import PlanarBody
 from trl_suite.bodies.reference import link_extents
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
-from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
+from trl_suite.controllers import GAIT_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
 from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, faces, flat_ground
@@ -102,7 +102,7 @@ class GaitTask(Task):
         parameters = load(character.spec.name, config.base_actions)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
-        timestep = CONTROL_TIMESTEP / config.substeps
+        timestep = GAIT_TIMESTEP / config.substeps
         self.set_timesteps(rules.FRAME, timestep)
         self._torques = actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned for joints without these
