@@ -56,7 +56,8 @@ TERMS = (  # of the reward of a cycle; weights are those of the character
 _FRAME_STEPS = round(FRAME / GAIT_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / GAIT_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / GAIT_TIMESTEP)
-OVER, GROUND, LOOK = range(3)  # why `go_on` returns: the step is over, the ground, or `watch`
+# Why `go_on` returns: the step is over; Python must move the ground window, or call `watch`.
+OVER, GROUND, WATCH = range(3)
 
 
 class GaitTaskState(NamedTuple):
@@ -65,7 +66,6 @@ class GaitTaskState(NamedTuple):
     Attributes:
       action: clipped action, (n, k).
       going: whether the current step is not over.
-      waiting: whether a cycle is over and the next one needs parameters.
       lasted, stumbled: duration of the step, and time with a stumble link on the ground in it.
       age: time since the start of the episode.
       start: x of the centre of mass at the beginning of the step, m.
@@ -77,7 +77,6 @@ class GaitTaskState(NamedTuple):
 
     action: np.ndarray
     going: np.ndarray = FLAG
-    waiting: np.ndarray = FLAG
     lasted: np.ndarray = WHOLE
     stumbled: np.ndarray = WHOLE
     age: np.ndarray = WHOLE
@@ -140,7 +139,6 @@ class GaitTaskData(NamedTuple):
 def set_gait(i: int, data: GaitTaskData) -> None:
     """Begins a cycle with the parameters of the current action."""
     action, vector = data.state.action, data.gait.state.vector
-    data.state.waiting[i] = False
     if data.by_cycle:
         for k in range(len(data.action_offset)):
             vector[i, k] = data.action_offset[k]
@@ -164,6 +162,7 @@ def go_on(i: int, watched: bool, data: GaitTaskData) -> int:
         if state.lasted[i] % _FRAME_STEPS == 0 and has_left(i, data.body):
             return GROUND
         gaits.act(i, data.gait)
+        # The actuators of these joints take torques.
         for k in range(data.gait.scratch.torque.shape[1]):
             data.body.ctrl[i, data.body.drive.first + k] = data.gait.scratch.torque[i, k]
         native.step(i, data.substeps, data.body.engine)
@@ -177,7 +176,7 @@ def go_on(i: int, watched: bool, data: GaitTaskData) -> int:
                 set_gait(i, data)
         state.going[i] = not (over or data.outcome.failed[i])
         if watched and i == 0 and state.age[i] % _FRAME_STEPS == 0:
-            return LOOK
+            return WATCH
     return OVER
 
 
@@ -276,8 +275,21 @@ def observed_blocks(
 
 
 @compiled
+def begin_episodes(env_ids: np.ndarray, data: GaitTaskData) -> None:
+    """Begins the gaits of episodes, after bodies were placed, and writes observations."""
+    ids, qpos, milestone = data.body.ids, data.body.physics.qpos, data.state.milestone
+    for i in env_ids:
+        gaits.begin(i, data.action_offset, data.gait)
+        milestone[i, 0], milestone[i, 1] = qpos[i, ids.qpos[0]], qpos[i, ids.qpos[1]]
+        observe(i, data)
+
+
+@compiled
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitTaskData) -> None:
-    """Begins steps; an action sets the gait of a cycle that begins with its step."""
+    """Begins steps; an action sets the gait of a cycle that begins with its step.
+
+    With the interface 'base_action', only the first cycle of an episode does; `go_on` begins the others.
+    """
     state, root = data.state, data.body.ids.links[0]
     for i in env_ids:
         for k in range(state.action.shape[1]):
@@ -285,7 +297,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: GaitTaskData) -> 
         state.lasted[i] = state.stumbled[i] = 0
         state.going[i] = True
         state.start[i] = data.body.physics.subtree_com[i, root, 0]
-        if data.by_cycle or state.waiting[i]:
+        if data.by_cycle or state.age[i] == 0:
             set_gait(i, data)
 
 
@@ -317,15 +329,7 @@ def finish_steps(env_ids: np.ndarray, data: GaitTaskData) -> None:
 
 
 @compiled
-def observe_all(env_ids: np.ndarray, fresh: bool, data: GaitTaskData) -> None:
-    """Writes observations; if `fresh`, episodes have just begun, as do their gaits."""
-    state, ids, qpos = data.state, data.body.ids, data.body.physics.qpos
+def observe_all(env_ids: np.ndarray, data: GaitTaskData) -> None:
+    """Writes observations."""
     for i in env_ids:
-        if fresh:
-            gaits.begin(i, data.action_offset, data.gait)
-            state.waiting[i] = True
-            state.milestone[i, 0], state.milestone[i, 1] = (
-                qpos[i, ids.qpos[0]],
-                qpos[i, ids.qpos[1]],
-            )
         observe(i, data)

@@ -229,7 +229,7 @@ class GaitTask(Task):
         self.body.place(env_ids, poses, rates, extents)
         for array in (*self.state, *self.outcome[1:]):  # all but the observation
             array[env_ids] = 0
-        rules.observe_all(env_ids, True, self._pack)
+        rules.begin_episodes(env_ids, self._pack)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         rules.begin_steps(env_ids, action, self._pack)
@@ -241,7 +241,7 @@ class GaitTask(Task):
             leaving = env_ids[interruption[env_ids] == rules.GROUND]
             if len(leaving):
                 self.body.recentre(leaving)
-            if self.watch is not None and (interruption[env_ids] == rules.LOOK).any():
+            if self.watch is not None and (interruption[env_ids] == rules.WATCH).any():
                 self.watch()
 
     def finish_step(self, env_ids: np.ndarray) -> None:
@@ -249,4 +249,4 @@ class GaitTask(Task):
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         env_ids = self.world.all_ids if env_ids is None else env_ids
-        rules.observe_all(env_ids, False, self._pack)
+        rules.observe_all(env_ids, self._pack)
