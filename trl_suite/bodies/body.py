@@ -124,14 +124,6 @@ def go(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
         travel.distance[i] = math.sqrt(x * x + y * y)
 
 
-@compiled
-def is_broken(i: int, limit: float, body: Any) -> bool:
-    """Returns whether a simulation has diverged, or a body turns faster than a limit, rad/s."""
-    return native.diverged(i, body.engine) or native.too_fast(
-        i, body.ids.turning, limit, body.physics.qvel
-    )
-
-
 class BodyData(NamedTuple):
     """A body in all simulations, for compiled functions.
 

@@ -11,15 +11,9 @@ from trl_suite.actuation.action_map import drive
 from trl_suite.actuation.muscles import Muscle, optimal_length, rest_length
 from trl_suite.arenas import PlanarArena
 from trl_suite.bodies.blocks import HEIGHTS, PLACES, SPEEDS, Block, Noise
-from trl_suite.bodies.body import (
-    CLEARANCE,
-    MAX_JOINT_SPEED,
-    Body,
-    BodyData,
-    feature_columns,
-    is_broken,
-)
+from trl_suite.bodies.body import CLEARANCE, MAX_JOINT_SPEED, Body, BodyData, feature_columns
 from trl_suite.characters import Character
+from trl_suite.engine import native
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
@@ -142,10 +136,12 @@ def observe_body(i: int, columns: Any, body: BodyData, observation: np.ndarray) 
 
 
 @compiled
-def breaks_down(i: int, limit: float, body: BodyData) -> bool:
-    """Returns whether a simulation diverged (see `is_broken`) or a body left its ground."""
-    x = body.physics.qpos[i, body.ids.qpos[0]]
-    return is_broken(i, limit, body) or planar_ground.is_lost(i, x, body.ground)
+def has_diverged(i: int, limit: float, body: BodyData) -> bool:
+    """Returns whether the physics has diverged, a joint exceeds `limit`, rad/s, or the ground was left."""
+    ids, physics = body.ids, body.physics
+    if native.diverged(i, ids.turning, limit, physics.qvel, body.engine):
+        return True
+    return planar_ground.is_lost(i, physics.qpos[i, ids.qpos[0]], body.ground)
 
 
 @compiled
@@ -159,7 +155,7 @@ def measure_all(env_ids: np.ndarray, stepped: bool, body: BodyData) -> None:
     """Measures and observes bodies; see `Body.measure`. Takes a pack."""
     for i in env_ids:
         if stepped:
-            body.diverged[i] = breaks_down(i, MAX_JOINT_SPEED, body)
+            body.diverged[i] = has_diverged(i, MAX_JOINT_SPEED, body)
             if body.diverged[i]:
                 continue
         measure(i, body)

@@ -19,14 +19,7 @@ from trl_suite.bodies.blocks import (
     Block,
     Reflection,
 )
-from trl_suite.bodies.body import (
-    CLEARANCE,
-    MAX_JOINT_SPEED,
-    Body,
-    BodyData,
-    feature_columns,
-    is_broken,
-)
+from trl_suite.bodies.body import CLEARANCE, MAX_JOINT_SPEED, Body, BodyData, feature_columns
 from trl_suite.characters import Character
 from trl_suite.engine import native
 from trl_suite.motion import quaternion
@@ -211,12 +204,13 @@ def observe_body(i: int, columns: Any, body: BodyData, observation: np.ndarray) 
 
 
 @compiled
-def breaks_down(i: int, limit: float, body: BodyData) -> bool:
-    """Returns whether a simulation diverged (see `is_broken`) or a body left its ground."""
-    root = body.physics.xpos[i, body.ids.links[0]]
-    return is_broken(i, limit, body) or spatial_ground.is_lost(
-        i, root[0], root[1], root[2], body.ground
-    )
+def has_diverged(i: int, limit: float, body: BodyData) -> bool:
+    """Returns whether the physics has diverged, a joint exceeds `limit`, rad/s, or the ground was left."""
+    ids, physics = body.ids, body.physics
+    root = physics.xpos[i, ids.links[0]]
+    if native.diverged(i, ids.turning, limit, physics.qvel, body.engine):
+        return True
+    return spatial_ground.is_lost(i, root[0], root[1], root[2], body.ground)
 
 
 @compiled
@@ -224,7 +218,7 @@ def measure_all(env_ids: np.ndarray, stepped: bool, body: BodyData) -> None:
     """Measures and observes bodies; see `Body.measure`. Takes a pack."""
     for i in env_ids:
         if stepped:
-            body.diverged[i] = breaks_down(i, MAX_JOINT_SPEED, body)
+            body.diverged[i] = has_diverged(i, MAX_JOINT_SPEED, body)
             if body.diverged[i]:
                 continue
         measure(i, body)

@@ -227,17 +227,14 @@ def reset(i: int, engine: Engine) -> None:
 
 
 @compiled
-def diverged(i: int, engine: Engine) -> bool:
-    """Returns whether a simulation has had a non-finite or huge state since its reset."""
+def diverged(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray, engine: Engine) -> bool:
+    """Returns whether a simulation has had a non-finite or huge state since its reset.
+
+    It has diverged as well if the magnitude of any of these velocities is above the limit, or NaN.
+    """
     for k in range(BAD[0], BAD[1]):
         if ints_at(engine.warnings[i] + _WARNING_STRIDE * k, 1)[0] > 0:
             return True
-    return False
-
-
-@compiled
-def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
-    """Returns whether the magnitude of any of these velocities is above a limit, or NaN."""
     for k in dofs:
         if not abs(qvel[i, k]) <= limit:
             return True

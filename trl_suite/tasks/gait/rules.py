@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import BodyData
-from trl_suite.bodies.planar import breaks_down, has_left, measure, observe_body
+from trl_suite.bodies.planar import has_diverged, has_left, measure, observe_body
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import GAIT_TIMESTEP, gaits
@@ -214,7 +214,7 @@ def judge(i: int, data: GaitTaskData) -> None:
         moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
         state.stuck[i] = moved < PROGRESS
         state.milestone[i, 0], state.milestone[i, 1] = x, z
-    diverged = breaks_down(i, MAX_UNDAMPED_SPEED, data.body)
+    diverged = has_diverged(i, MAX_UNDAMPED_SPEED, data.body)
     data.outcome.diverged[i] = diverged  # keeps the last observation
     data.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
 
@@ -318,7 +318,7 @@ def finish_steps(env_ids: np.ndarray, data: GaitTaskData) -> None:
     for i in env_ids:
         state.duration[i] = GAIT_TIMESTEP * state.lasted[i]
         state.stumbling[i] = GAIT_TIMESTEP * state.stumbled[i]
-        outcome.diverged[i] |= breaks_down(i, math.inf, data.body)
+        outcome.diverged[i] |= has_diverged(i, math.inf, data.body)
         failed = outcome.failed[i] or outcome.diverged[i]
         if outcome.diverged[i]:
             state.fell[i] = state.stuck[i] = False

@@ -10,7 +10,7 @@ import numpy as np
 from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
 from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, go
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
-from trl_suite.bodies.spatial import LINES, breaks_down, measure, observe_body
+from trl_suite.bodies.spatial import LINES, has_diverged, measure, observe_body
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import (
@@ -159,7 +159,7 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     body, state, outcome, plan = data.body, data.state, data.outcome, data.plan
     tick(i, data.period, data.clock)
     state.lasted[i] += 1
-    data.outcome.diverged[i] = breaks_down(i, MAX_JOINT_SPEED, body)
+    data.outcome.diverged[i] = has_diverged(i, MAX_JOINT_SPEED, body)
     if data.outcome.diverged[i]:
         outcome.failed[i] = state.over[i] = True
         return False
