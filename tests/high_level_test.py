@@ -26,7 +26,7 @@ from helpers import (
 from trl_suite import policies, rendering, suite
 from trl_suite.controllers import footstep_controller
 from trl_suite.policies import files as policy_files
-from trl_suite.tasks.navigation import hierarchical_rules, scripted
+from trl_suite.tasks.navigation import hierarchical, scripted
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'
@@ -39,7 +39,7 @@ AHEAD = np.zeros(5)  # two steps of half a metre, straight on
 
 
 def shipped_controller():
-    return footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
+    return footstep_controller.load(policies.reference(hierarchical.CONTROLLER))
 
 
 def started(id_=FOREST, **options):
@@ -505,12 +505,12 @@ class ControllerTest(FolderTest):
         return environment.physics.data.qpos.copy()
 
     def test_a_controller_by_id_alias_path_policy_or_function(self):
-        shipped = policies.reference(hierarchical_rules.CONTROLLER)
+        shipped = policies.reference(hierarchical.CONTROLLER)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
         expected = self.positions()
         for source in (
-            hierarchical_rules.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
+            hierarchical.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
             lambda observation: shipped(observation),
         ):  # fmt: skip
             with self.subTest(source=str(source)):
@@ -535,7 +535,7 @@ class ControllerTest(FolderTest):
             self.positions(controller=lambda observation: set()())
 
     def test_another_body_is_a_warning(self):
-        shipped = policies.reference(hierarchical_rules.CONTROLLER)
+        shipped = policies.reference(hierarchical.CONTROLLER)
         with warnings.catch_warnings():
             warnings.simplefilter('error')
             started(PLANE)  # no warning
@@ -720,7 +720,7 @@ class OptionTest(FolderTest):
             (lambda: rendering.frame(started(FOREST)[0], 60, 80, ghost=True),
              'the task HierarchicalNavigation has no reference clip'),
             (lambda: started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0'),
-             f"did you mean '{hierarchical_rules.CONTROLLER}'"),
+             f"did you mean '{hierarchical.CONTROLLER}'"),
             (lambda: started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0'),
              "policy of 'FSM_Goat2D.*' observes .*plan 13"),
             (lambda: footstep_controller.load(str(self.folder / 'broken.npz')), 'broken.npz'),

@@ -22,11 +22,11 @@ from trl_suite.tasks.common.footstep_plan import PLAN_SIZE
 from trl_suite.tasks.navigation import scripted
 from trl_suite.tasks.navigation.direct import DirectNavigation
 from trl_suite.tasks.navigation.hierarchical import (
+    CONTROLLER,
     STEP_LENGTH,
     HierarchicalNavigation,
     plan_action_map,
 )
-from trl_suite.tasks.navigation.hierarchical_rules import CONTROLLER
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
 from trl_suite.vector import VectorEnvironment
 

@@ -131,8 +131,8 @@ class Drive(NamedTuple):
 
 
 @compiled_inline
-def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
-    """Control k of an action, in physical units, before norms are clamped."""
+def in_units(i: int, k: int, action: np.ndarray, by: Drive) -> float:
+    """Returns number k of an action, clipped, in physical units; norms are clamped afterwards."""
     return min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
 
 
@@ -142,7 +142,7 @@ def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
     if _drive_rotations(i, action, by, ctrl, by.angles, by.angle_balls, by.hinges):
         return
     for k in range(len(by.offset)):
-        ctrl[i, by.first + k] = _meant(i, k, action, by)
+        ctrl[i, by.first + k] = in_units(i, k, action, by)
     for ball in range(len(by.torque_limits)):
         square = 0.0
         for k in by.torque_balls[ball]:
@@ -171,13 +171,13 @@ def _drive_rotations(
     if angles is None or balls is None or hinges is None:
         return False
     for k in range(hinges.shape[1]):
-        ctrl[i, by.first + hinges[1, k]] = _meant(i, hinges[0, k], action, by)
+        ctrl[i, by.first + hinges[1, k]] = in_units(i, hinges[0, k], action, by)
     for ball in range(len(angles)):
         column = angles[ball]
-        angle = _meant(i, column, action, by)
-        x = _meant(i, column + 1, action, by)
-        y = -_meant(i, column + 3, action, by)
-        z = _meant(i, column + 2, action, by)
+        angle = in_units(i, column, action, by)
+        x = in_units(i, column + 1, action, by)
+        y = -in_units(i, column + 3, action, by)
+        z = in_units(i, column + 2, action, by)
         length = math.sqrt(x * x + y * y + z * z)
         if length == 0.0:
             x, y, z, length = 0.0, -1.0, 0.0, 1.0

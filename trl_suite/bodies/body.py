@@ -114,7 +114,7 @@ class Travel(NamedTuple):
 
 
 @compiled
-def go(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
+def write_distance(i: int, along: bool, measurement: Measurement, travel: Travel) -> None:
     """Writes the distance of the root from the start, along the first heading or in any direction."""
     x = measurement.root[i, 0] - travel.origin[i, 0]
     y = measurement.root[i, 1] - travel.origin[i, 1]

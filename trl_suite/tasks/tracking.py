@@ -15,7 +15,7 @@ import numpy as np
 from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block, action_reflection, by_name, columns, layout, reflected
-from trl_suite.bodies.body import Measurement, Travel, go
+from trl_suite.bodies.body import Measurement, Travel, write_distance
 from trl_suite.bodies.planar import PlanarBody
 from trl_suite.bodies.reference import (
     CONTROL_TIMESTEP,
@@ -462,7 +462,7 @@ def proceed(i: int, data: TrackingData) -> bool:
     if data.diverged[i]:  # keeps the last finite observation
         conclude(i, True, data.outcome)
         return False
-    go(i, data.along, data.measurement, data.travel)
+    write_distance(i, data.along, data.measurement, data.travel)
     return True
 
 

@@ -162,7 +162,7 @@ def observe_place(
 
 
 @compiled
-def follow(i: int, count: int, measurement: Measurement, goals: Goals) -> None:
+def store_trace(i: int, count: int, measurement: Measurement, goals: Goals) -> None:
     """Stores the position of a walker after `count` control steps."""
     if count % TRACE_EVERY == 0:
         for k in range(3):
@@ -170,7 +170,7 @@ def follow(i: int, count: int, measurement: Measurement, goals: Goals) -> None:
 
 
 @compiled
-def remember(i: int, physics: SpatialState, measurement: Measurement, data: GoalData) -> None:
+def store_start(i: int, physics: SpatialState, measurement: Measurement, data: GoalData) -> None:
     """Stores the positions of walker and ball at the beginning of a step."""
     for k in range(3):
         data.goals.walker[i, k] = measurement.com[i, k]

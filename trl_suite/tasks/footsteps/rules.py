@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.bodies.body import go
+from trl_suite.bodies.body import write_distance
 from trl_suite.bodies.reference import feature, moment, observe_phase
 from trl_suite.bodies.state import FLAG, PLACE, POINT, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
@@ -215,6 +215,6 @@ def align_all(env_ids: np.ndarray, tracks: np.ndarray, data: FootstepData) -> No
 def observe_all(env_ids: np.ndarray, data: FootstepData) -> None:
     """Writes distances, reward terms of the current state, and observations."""
     for i in env_ids:
-        go(i, data.tracking.along, data.tracking.measurement, data.tracking.travel)
+        write_distance(i, data.tracking.along, data.tracking.measurement, data.tracking.travel)
         compare(i, data)
         observe(i, data)

@@ -14,7 +14,7 @@ import numpy as np
 
 from trl_suite.actuation.muscles import PLAIN
 from trl_suite.bodies.blocks import Block
-from trl_suite.bodies.body import go
+from trl_suite.bodies.body import write_distance
 from trl_suite.bodies.reference import feature, moment, observe_phase
 from trl_suite.characters import Character
 from trl_suite.tasks import rewards
@@ -105,7 +105,7 @@ def finish_all(env_ids: np.ndarray, data: TrackingData) -> None:
 def observe_all(env_ids: np.ndarray, data: TrackingData) -> None:
     """Writes distances, reward terms of the current state, and observations."""
     for i in env_ids:
-        go(i, data.along, data.measurement, data.travel)
+        write_distance(i, data.along, data.measurement, data.travel)
         compare(i, data)
         observe(i, data)
 

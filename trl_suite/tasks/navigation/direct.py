@@ -15,7 +15,7 @@ import numpy as np
 
 from trl_suite.arenas import SpatialArena
 from trl_suite.bodies.blocks import Block
-from trl_suite.bodies.body import go
+from trl_suite.bodies.body import write_distance
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, moment, observe_phase
 from trl_suite.bodies.spatial import SpatialState
 from trl_suite.characters import Character
@@ -31,10 +31,10 @@ from trl_suite.tasks.common.goals import (
     GoalData,
     GoalTask,
     dribble,
-    follow,
     observe_goal,
-    remember,
     soccer_terms,
+    store_start,
+    store_trace,
     test_goal,
 )
 from trl_suite.tasks.footsteps.planner import Plans
@@ -148,7 +148,7 @@ def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
     for i in env_ids:
         aims.goals.wanted[i] = aims.ball.wanted[i] = False
         if proceed(i, tracking):
-            follow(i, steps[i], measurement, aims.goals)
+            store_trace(i, steps[i], measurement, aims.goals)
             if aims.with_ball:
                 dribble(i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome)
             wanted += test_goal(i, steps[i], measurement, aims)
@@ -161,7 +161,7 @@ def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
     for i in env_ids:
         tracking = data.tracking
         if not tracking.outcome.diverged[i]:
-            remember(i, data.physics, tracking.measurement, data.aims)
+            store_start(i, data.physics, tracking.measurement, data.aims)
             compare(i, data)
             conclude(i, tracking.measurement.fallen[i], tracking.outcome)
             observe(i, data)
@@ -172,7 +172,7 @@ def observe_all(env_ids: np.ndarray, data: DirectData) -> None:
     """Writes distances, reward terms of the current state, and observations."""
     for i in env_ids:
         tracking = data.tracking
-        go(i, tracking.along, tracking.measurement, tracking.travel)
+        write_distance(i, tracking.along, tracking.measurement, tracking.travel)
         compare(i, data)
         observe(i, data)
 

@@ -48,6 +48,10 @@ from trl_suite.tasks.task import Marker, drawn_seed
 from trl_suite.util.options import Range, option
 
 INTERFACES = ('plan', 'frame')
+# In the option `controller`, `registry.build` replaces an id by the policy that is shipped for it.
+CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'
+GOAL_REACHED = 1.0  # m; default
+FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 # A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
 # at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
@@ -55,6 +59,7 @@ PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
+MAPS = ('height', 'velocity')
 TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 
 
@@ -63,7 +68,7 @@ class HierarchicalConfig(GroundConfig):
     """Options of `HierarchicalNavigation`."""
 
     controller: Any = option(
-        rules.CONTROLLER,
+        CONTROLLER,
         (
             'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
             'of its file, or a function'
@@ -76,7 +81,7 @@ class HierarchicalConfig(GroundConfig):
         'targets, and a plan takes effect only in a step that begins a footstep',
         choices=INTERFACES,
     )
-    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=rules.MAPS)
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
     step_length: float = option(
         STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0
     )
@@ -88,7 +93,7 @@ class HierarchicalConfig(GroundConfig):
     )
     goal_reached: float | None = option(
         None,
-        f'distance within which a goal is reached, by default {rules.GOAL_REACHED:g}, or a ball is at its goal, '
+        f'distance within which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
         f'by default {AT_GOAL:g}',
         unit='m',
         above=0,
@@ -99,7 +104,7 @@ class HierarchicalConfig(GroundConfig):
         'the terrain determines where goals are drawn',
         unit='m',
         at_least=0,
-        at_most=rules.FARTHEST_GOAL,
+        at_most=FARTHEST_GOAL,
     )
     start_phases: Sequence[float] = option(
         (0.1, 0.6),
@@ -124,6 +129,7 @@ class HierarchicalNavigation(Planned, GoalTask):
     """
 
     ABOUT, RULE = 'root', 'far'
+    finish_all, observe_all = rules.finish_all, rules.observe_all
     length = 0.5
     watch: Callable[[], None] | None = None
 
@@ -134,7 +140,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         character: Character,
         arena: SpatialArena,
         steps: FootstepLibrary,
-        config: HierarchicalConfig = HierarchicalConfig(),
+        config: HierarchicalConfig,
         ball: Ball | None = None,
         *,
         actuation_model: str = 'position',
@@ -145,7 +151,7 @@ class HierarchicalNavigation(Planned, GoalTask):
           character: a spatial biped without actuators; it is attached to the arena.
           arena: the arena with its terrain.
           steps: library of single steps of this character, for the initial pose and the clock.
-          config: the options.
+          config: the options, with a controller, not the id of an environment.
           ball: a ball of the arena, for dribbling; the terrain must be level.
           actuation_model: 'position'.
 
@@ -169,7 +175,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
-            (AT_GOAL if ball else rules.GOAL_REACHED) if reached is None else float(reached)
+            (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
         self.steps_vary = by_plan = self.interface == 'plan'
         if by_plan:
@@ -226,8 +232,7 @@ class HierarchicalNavigation(Planned, GoalTask):
             columns=columns(self.observed),
             terms=terms_data(rules.NAVIGATION_TERMS),
             by_plan=self.interface == 'plan',
-            plan_offset=self.action_map.action_offset,
-            plan_scale=self.action_map.action_scale,
+            plan_map=self.action_map.drive(0),
         )
 
     # Episodes.
@@ -304,10 +309,7 @@ class HierarchicalNavigation(Planned, GoalTask):
     def finish_step(self, env_ids: np.ndarray) -> None:
         if rules.score_all(env_ids, self._pack):
             self._redraw_goals(env_ids)
-        rules.finish_all(env_ids, self._pack)
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        rules.observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+        self.finish_all(env_ids, self._pack)
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the plan, past positions of the centre of mass, and the goal."""

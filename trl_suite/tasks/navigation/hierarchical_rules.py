@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trl_suite.actuation.action_map import Drive, in_units
 from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
-from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, go
+from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, write_distance
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
 from trl_suite.bodies.spatial import LINES, has_diverged, measure, observe_body
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
@@ -16,19 +17,16 @@ from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, upd
 from trl_suite.tasks.common.goals import (
     GoalData,
     dribble,
-    follow,
     observe_goal,
-    remember,
+    store_start,
+    store_trace,
     test_goal,
 )
 from trl_suite.tasks.rewards import FALL_THRESHOLD, Outcome, Term, conclude, give, sample_fall
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.compiled import compiled
 
-CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
-MAPS = ('height', 'velocity')
-GOAL_REACHED = 1.0  # m; default
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # constant reward of a step without a fall
 NAVIGATION_TERMS = (
@@ -51,7 +49,6 @@ SURFACE = Block(
     Reflection(np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)),
 )
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
-FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 LONGEST = 60  # limit of control steps per step; the clock switches stance long before
 
 
@@ -87,7 +84,7 @@ class PlanningData(NamedTuple):
       columns: first columns of the blocks of the observation; -1: not observed.
       terms: the reward terms of a goal.
       by_plan: whether a step is a footstep, not a control step.
-      plan_offset, plan_scale: offset and scale of actions.
+      plan_map: the map from actions to plans, in m and rad.
     """
 
     body: BodyData
@@ -102,8 +99,7 @@ class PlanningData(NamedTuple):
     columns: Any
     terms: Any
     by_plan: bool
-    plan_offset: np.ndarray
-    plan_scale: np.ndarray
+    plan_map: Drive
 
 
 # A step: `begin_steps`; then for every control step the action of the footstep controller, physics and
@@ -111,10 +107,10 @@ class PlanningData(NamedTuple):
 
 
 @compiled
-def look(i: int, data: PlanningData) -> None:
+def measure_walker(i: int, data: PlanningData) -> None:
     """Measures the body and its distance from the start."""
     measure(i, data.body)
-    go(i, False, data.body.measurement, data.travel)
+    write_distance(i, False, data.body.measurement, data.travel)
 
 
 @compiled
@@ -126,18 +122,13 @@ def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
     heading = measurement.heading[i]
     cosine, sine = math.cos(heading), math.sin(heading)
     for which in range(2):
-        ahead, left = meant(i, 2 * which, action, data), meant(i, 2 * which + 1, action, data)
+        ahead = in_units(i, 2 * which, action, data.plan_map)
+        left = in_units(i, 2 * which + 1, action, data.plan_map)
         x = measurement.root[i, 0] + (cosine * ahead - sine * left)
         y = measurement.root[i, 1] + (sine * ahead + cosine * left)
         plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
         plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
-    plan.heading[i] = heading + meant(i, 4, action, data)
-
-
-@compiled_inline
-def meant(i: int, k: int, action: np.ndarray, data: PlanningData) -> float:
-    """Returns number k of the action, clipped, in physical units, m or rad."""
-    return min(max(action[i, k], -1.0), 1.0) * data.plan_scale[k] + data.plan_offset[k]
+    plan.heading[i] = heading + in_units(i, 4, action, data.plan_map)
 
 
 @compiled
@@ -163,14 +154,14 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     if data.outcome.diverged[i]:
         outcome.failed[i] = state.over[i] = True
         return False
-    look(i, data)
+    measure_walker(i, data)
     count, measurement = data.clock.steps[i], body.measurement
     if count % SAMPLE_FRAMES == 0:
         sample_fall(i, measurement.fallen[i], state.down)
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
-    follow(i, count, measurement, data.aims.goals)
+    store_trace(i, count, measurement, data.aims.goals)
     state.over[i] = (
         plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST or not data.by_plan
     )
@@ -180,7 +171,7 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
 
 
 @compiled
-def score(i: int, data: PlanningData) -> bool:
+def score_step(i: int, data: PlanningData) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
     body, aims, state, outcome = data.body, data.aims, data.state, data.outcome
     measurement, place, begin = body.measurement, aims.goals.place, aims.goals.walker
@@ -231,10 +222,10 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
     """Sets plans where footsteps begin, and writes the footstep controller's observations."""
     body, state = data.body, data.state
     for i in env_ids:
-        look(i, data)
+        measure_walker(i, data)
         lay_plan(i, action, data)
         state.lasted[i] = 0
-        remember(i, body.physics, body.measurement, data.aims)
+        store_start(i, body.physics, body.measurement, data.aims)
         data.plan.landed[i] = False
         observe_for_controller(i, data)
 
@@ -243,7 +234,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
 def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
-        look(i, data)
+        measure_walker(i, data)
         lay_plan(i, action, data)
         observe_for_controller(i, data)
         observe(i, data)
@@ -263,7 +254,7 @@ def score_all(env_ids: np.ndarray, data: PlanningData) -> int:
     """Writes reward terms; returns in how many simulations goal or ball must be redrawn."""
     wanted = 0
     for i in env_ids:
-        wanted += score(i, data)
+        wanted += score_step(i, data)
     return wanted
 
 
@@ -278,7 +269,7 @@ def finish_all(env_ids: np.ndarray, data: PlanningData) -> None:
 
 @compiled
 def observe_all(env_ids: np.ndarray, data: PlanningData) -> None:
-    """Observes."""
+    """Writes distances and observations, after bodies were measured."""
     for i in env_ids:
-        look(i, data)
+        write_distance(i, False, data.body.measurement, data.travel)
         observe(i, data)

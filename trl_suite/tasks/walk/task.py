@@ -12,7 +12,7 @@ import numpy as np
 
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.bodies.blocks import Block, Noise, columns
-from trl_suite.bodies.body import Measurement, Travel, go
+from trl_suite.bodies.body import Measurement, Travel, write_distance
 from trl_suite.bodies.reference import link_extents
 from trl_suite.characters import Character
 from trl_suite.engine import World
@@ -53,7 +53,7 @@ class WalkData(NamedTuple):
 @compiled
 def observe(i: int, data: WalkData) -> None:
     """Writes the distance, and the block `TARGET_HEADING`."""
-    go(i, True, data.measurement, data.travel)
+    write_distance(i, True, data.measurement, data.travel)
     if data.columns.target_heading >= 0:
         bearing = data.travel.origin[i, 2] - data.measurement.heading[i]
         data.outcome.observation[i, data.columns.target_heading] = math.cos(bearing)
