@@ -169,7 +169,7 @@ class Body(abc.ABC):
     fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
     control_all: Compiled
     measure_all: Compiled
-    physics: Any  # fields of MjData that are measured
+    physics_fields: Any  # type of `data.physics`: fields of MjData that are measured
     character: Character
     arena: Any
     blocks: tuple[Block, ...]
@@ -226,7 +226,7 @@ class Body(abc.ABC):
         self.data = BodyData(
             engine=world.engine,
             ids=self.ids,
-            physics=self.physics(*(getattr(world, name) for name in self.physics._fields)),
+            physics=self.physics_fields(*(getattr(world, n) for n in self.physics_fields._fields)),
             ground=self._ground(),
             drive=action_map.drive(int(first)),
             ctrl=world.ctrl,
@@ -246,12 +246,12 @@ class Body(abc.ABC):
     def _ground(self) -> Any:
         """Returns the ground of all simulations, for compiled functions."""
 
-    def control(self, env_ids: np.ndarray, action: np.ndarray) -> None:
-        """Writes the controls of some simulations; moves ground windows, so that images show them.
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        """Writes the controls of some simulations; moves the windows of ground that their bodies have left.
 
         Args:
-          env_ids: indices of simulations.
           action: actions of all simulations, (n, k), in [-1, 1].
+          env_ids: indices of simulations.
         """
         if self.control_all(env_ids, action, self.pack):
             self.recentre(env_ids[self.data.leaving[env_ids]])

@@ -176,8 +176,8 @@ def control_all(env_ids: np.ndarray, action: np.ndarray, body: BodyData) -> int:
 class PlanarBody(Body):
     """A planar character in every simulation of a world; see `Body`."""
 
-    # The first two are compiled functions, not methods: they take a pack.
-    control_all, measure_all, physics = control_all, measure_all, PlanarState
+    control_all, measure_all = control_all, measure_all  # compiled functions, not methods
+    physics_fields = PlanarState
     arena: PlanarArena
 
     def __init__(

@@ -247,8 +247,8 @@ class SpatialBody(Body):
     """A three-dimensional character in every simulation of a world; see `Body`."""
 
     fields = ('xquat',)
-    # The first two are compiled functions, not methods: they take a pack.
-    control_all, measure_all, physics = control_all, measure_all, SpatialState
+    control_all, measure_all = control_all, measure_all  # compiled functions, not methods
+    physics_fields = SpatialState
     arena: SpatialArena
 
     def __init__(

@@ -315,6 +315,7 @@ class Environment(composer.Environment):
             core.restart(0)
             self.at_limit = False
             self._show_reward(0.0)
+            # Composer's hooks: that of the task, `Task.initialize_episode`, and those of entities.
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
             if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)

@@ -59,7 +59,8 @@ class Task(composer.Task):
     simulations. A custom task may do the same with plain NumPy.
 
     An environment calls `bind` once, `reset` for simulations in which an episode starts, and `step`
-    for the others. A step consists of
+    for the others, by way of `attach`, `begin` and `advance`, which add the components. A step
+    consists of
 
     1. `apply_action`: clips the actions, sets the controls, and moves ground windows if necessary;
        or, where a controller drives the joints, sets the plan or the gait that it follows;
@@ -104,7 +105,7 @@ class Task(composer.Task):
     in_parts = True  # whether several threads may call the task, each for some simulations
     step_in_parts = True  # the same, without components
     levels: Levels | None = None  # the component that chooses terrain, if there is one
-    _begun = False  # whether composer has reset the task, and no step has followed yet
+    _just_reset = False  # whether composer has reset the task, and no step has followed yet
 
     # Methods that a subclass implements.
 
@@ -171,6 +172,7 @@ class Task(composer.Task):
 
     def attach(self, world: World) -> None:
         """Binds the task and its components to a world."""
+        # Those of the task without components: composer may compile, and so attach, a second time.
         own, self.step_in_parts = self.__dict__.setdefault('_own', (self.observed, self.in_parts))
         self.in_parts = self.step_in_parts
         self.observed, self.blocks = own, layout(own)
@@ -337,15 +339,15 @@ class Task(composer.Task):
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
         self.begin(self.world.all_ids, [random_state])
-        self._begun = True
+        self._just_reset = True
 
     def before_step(
         self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
     ) -> None:
-        if self._begun:
+        if self._just_reset:
             # A plain composer.Environment leaves actuator velocities of zero after a reset.
             self.world.forward(self.world.all_ids)
-            self._begun = False
+            self._just_reset = False
         self._stepped = int(self.world.engine.steps[0])
         given = self.action_map.checked(action)[None]
         for component in self.components:

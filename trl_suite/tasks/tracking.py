@@ -111,21 +111,21 @@ class BodyTask(Task):
         self.joint_map = actuation.add(character, actuation_model, self.physics_timestep, **options)
 
     @abc.abstractmethod
-    def _bind(self, world: World) -> Any:
-        """Allocates arrays; returns the data of `finish_all` and `observe_all`."""
+    def _bind_body(self, world: World) -> Any:
+        """Binds the body, and what it is compared with; returns the data of `finish_all` and `observe_all`."""
 
     @abc.abstractmethod
-    def _start(
+    def _draw_start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draws ground and initial state, with `_begin_ground`.
+        """Begins episodes: draws ground, with `_begin_ground`, and the start, which it returns.
 
         Returns:
           The arguments of `body.place`: poses, rates, and extents in the plane, or spawns.
         """
 
-    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        """Called by `reset` after the characters of some simulations were placed."""
+    def _placed(self, env_ids: np.ndarray) -> None:
+        """Called by `reset` after the characters of some simulations were placed on the ground."""
 
     @property
     def root_entity(self) -> PlanarArena | SpatialArena:
@@ -137,7 +137,7 @@ class BodyTask(Task):
         self._random = [np.random.default_rng(0)] * n  # for draws within an episode
         self._allocate(n, self.travel.distance)
         self.saved = (self.clock, self.travel, self.outcome)
-        self._pack = packed(self._bind(world))
+        self._pack = packed(self._bind_body(world))
 
     @property
     def phase(self) -> np.ndarray:
@@ -151,12 +151,13 @@ class BodyTask(Task):
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         self.world.reset(env_ids)
-        self.body.place(env_ids, *self._start(env_ids, random_states))
+        start = self._draw_start(env_ids, random_states)
+        self.body.place(env_ids, *start)
         for array in self.outcome[1:]:  # all but the observation
             array[env_ids] = 0
-        self._begun_on_ground(env_ids)
+        self._placed(env_ids)
         self.observe(env_ids)
-        self.outcome.reward_terms[env_ids] = 0.0
+        self.outcome.reward_terms[env_ids] = 0.0  # `observe_all` wrote those of the start
 
     def _begin_clocks(self, env_ids: np.ndarray) -> None:
         """Sets the clocks of some simulations to `clock.start`."""
@@ -166,27 +167,22 @@ class BodyTask(Task):
 
     def _begin_ground(self, i: int, seed: np.random.SeedSequence, random: Any = None) -> None:
         """Begins an episode on random ground: in 3D at a random place, if there is `random`."""
-        ground = self._ground(i, seed)
-        if isinstance(ground, PlanarGround):
-            self.arena.begin_episode(i, ground)
+        terrain, level = self.arena.terrain, self.config.terrain_level
+        if not self._spatial:
+            strip = PlanarGround(terrain, seed, terrain_level=level, **self._flat_part(i))
+            self.arena.begin_episode(i, strip)
             return
+        ground = SpatialGround(terrain, seed, terrain_level=level)
         if random is not None:
             self.travel.origin[i] = ground.spawn(random)
         self.arena.begin_episode(i, ground, self.travel.origin[i, :2])
 
-    def _ground(self, i: int, seed: np.random.SeedSequence) -> PlanarGround | SpatialGround:
-        """Returns the ground of an episode."""
-        terrain, level = self.arena.terrain, self.config.terrain_level
-        if self._spatial:
-            return SpatialGround(terrain, seed, terrain_level=level)
-        return PlanarGround(terrain, seed, terrain_level=level, **self._flat(i))
-
-    def _flat(self, i: int) -> dict[str, Any]:
+    def _flat_part(self, i: int) -> dict[str, Any]:
         """Returns where the ground is flat at the start, in the plane; see `PlanarGround`."""
         return {}
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        self.body.control(env_ids, action)
+        self.body.apply_action(action, env_ids)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.body.measure(env_ids, stepped=True)
@@ -220,7 +216,7 @@ class TrackingTask(BodyTask):
     draws = True  # whether random numbers are drawn within an episode
     along = False  # whether the distance travelled is along the heading at the start
     mirrored = False  # whether observations and actions are mirrored in left stance
-    tracks = 1  # parts of a clip, each of which is a track of the reference
+    clip_parts = 1  # a reference has a track for each part of a clip
     hidden: tuple[str, ...] = ()  # names of blocks that are not observed
     reference: Reference
 
@@ -271,9 +267,9 @@ class TrackingTask(BodyTask):
         self.action_map = self.joint_map
         self._start_phase = start_phases(config.start_phase)
         self.full = *self.body.blocks, PHASE.observed_if(phase), *extras
-        given = tuple(block for block in self.full if block.name not in hidden)
+        shown = tuple(block for block in self.full if block.name not in hidden)
         self._reflection = self._reflected(self.full)
-        self.mirror = None if mirrored else self._reflected(given)
+        self.mirror = None if mirrored else self._reflected(shown)
         self._kept: np.ndarray = np.zeros(0, int)  # all
         if mirrored or hidden:
             slices = layout(self.full)
@@ -281,11 +277,11 @@ class TrackingTask(BodyTask):
                 [
                     slices[block.name].start
                     + np.array(block.kept if mirrored and block.kept else range(block.size))
-                    for block in given
+                    for block in shown
                     if block.size
                 ]
             )
-        self.observed = tuple(block.mirrored() for block in given) if mirrored else given
+        self.observed = tuple(block.mirrored() for block in shown) if mirrored else shown
 
     @abc.abstractmethod
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
@@ -299,21 +295,21 @@ class TrackingTask(BodyTask):
         actions = action_reflection(self.character, self.action_map)
         return Mirror(*reflected(blocks), *actions, slices['phase'].start)
 
-    def _track(self) -> Reference:
-        """Returns the reference, after the body was bound."""
+    def _make_reference(self) -> Reference:
+        """Returns the reference; it is measured with the body, which was bound."""
         motion, model = self.motion, self.world.models[0]
         if isinstance(motion, Clip):
-            return Reference.of_clip(motion, self.body, model, self.tracks)
+            return Reference.of_clip(motion, self.body, model, self.clip_parts)
         return Reference.of_steps(motion, self.body, model)
 
-    def _bind(self, world: World) -> Any:
+    def _bind_body(self, world: World) -> Any:
         """Binds body, reference and full observation; returns the `TrackingData`."""
         full = self.outcome.observation
         if self.observed != self.full:
             full = np.zeros((world.n, sum(block.size for block in self.full)))
             self.saved = (*self.saved, by_name('Full', {'observation': full}))
         self.body.bind(world, self.joint_map, full, self.full, self.ABOUT)
-        self.reference = self._track()
+        self.reference = self._make_reference()
         none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
         self._view = View(
             full=full,
@@ -322,7 +318,7 @@ class TrackingTask(BodyTask):
             source=none if mirror is None else mirror.observation_index,
             sign=np.zeros(0) if mirror is None else mirror.observation_sign,
             kept=self._kept,
-            given_phase=self.blocks['phase'].start if self.mirrored else -1,
+            phase=self.blocks['phase'].start if self.mirrored else -1,
             action_source=none if mirror is None else mirror.action_index,
             action_sign=np.zeros(0) if mirror is None else mirror.action_sign,
             action=np.zeros((world.n, len(self.joint_map))),
@@ -332,7 +328,7 @@ class TrackingTask(BodyTask):
             measurement=self.body.measurement,
             diverged=self.body.data.diverged,
             outcome=self.outcome,
-            given=self._view,
+            shown=self._view,
             clock=self.clock,
             travel=self.travel,
             period=self.period,
@@ -346,7 +342,7 @@ class TrackingTask(BodyTask):
             action = self._view.action
         super().apply_action(action, env_ids)
 
-    def _start(
+    def _draw_start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
@@ -361,14 +357,14 @@ class TrackingTask(BodyTask):
         if isinstance(motion, FootstepLibrary):
             return *pose_of_step(motion, self._first, self.phase[env_ids]), spawns
         if not self._spatial:
-            share = self.tracks * phase
+            share = self.clip_parts * phase
             track = np.floor(share)
             return self.reference.planar_state(share - track, track.astype(int))
         poses, rates = motion.state(phase * self.period)
         poses[:, :2] = 0.0
         return poses, rates, spawns
 
-    def _flat(self, i: int) -> dict[str, Any]:
+    def _flat_part(self, i: int) -> dict[str, Any]:
         spawn, centre = self.config.spawn, 0.0
         if spawn == 'upstream':
             # The boundary of the original's segments: it builds them before it moves the root to 0.
@@ -416,7 +412,7 @@ class View(NamedTuple):
       mirrored: whether observations and actions are reflected in left stance.
       source, sign: a reflected full observation is `full[source] * sign`, (size,).
       kept: columns of the full observation that are observed, (k,); all of them if it is empty.
-      given_phase: column of the phase in the observation.
+      phase: column of the phase in the observation.
       action_source, action_sign: a reflected action is `action[source] * sign`.
       action: actions after reflection, (n, k); scratch.
     """
@@ -427,7 +423,7 @@ class View(NamedTuple):
     source: np.ndarray
     sign: np.ndarray
     kept: np.ndarray
-    given_phase: int
+    phase: int
     action_source: np.ndarray
     action_sign: np.ndarray
     action: np.ndarray
@@ -437,7 +433,7 @@ class TrackingData(NamedTuple):
     """Data for the compiled functions of tasks that track a reference motion.
 
     Attributes:
-      measurement: of the bodies, which write their own blocks to `given.full`.
+      measurement: of the bodies, which write their own blocks to `shown.full`.
       diverged: whether the physics has diverged in the last step, (n,).
       period: that of the motion, s.
       along: whether the distance travelled is along the heading at the start, not in any direction.
@@ -446,7 +442,7 @@ class TrackingData(NamedTuple):
     measurement: Measurement
     diverged: np.ndarray
     outcome: Outcome
-    given: View
+    shown: View
     clock: Clock
     travel: Travel
     period: float
@@ -484,7 +480,7 @@ def publish(i: int, view: View, outcome: Outcome) -> None:
             observation[i, k] = full[i, column]
     if view.mirrored:  # the phase of the single step
         phase = full[i, view.columns.phase]
-        observation[i, view.given_phase] = 2 * (phase - 0.5 if left else phase)
+        observation[i, view.phase] = 2 * (phase - 0.5 if left else phase)
 
 
 @compiled

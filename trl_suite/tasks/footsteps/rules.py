@@ -161,14 +161,14 @@ def compare(i: int, data: FootstepData) -> None:
 def observe(i: int, data: FootstepData) -> None:
     """Writes the blocks after those of the body: phase, contact and plan, and the goal."""
     tracking = data.tracking
-    columns, full, measurement = tracking.given.columns, tracking.given.full, tracking.measurement
+    columns, full, measurement = tracking.shown.columns, tracking.shown.full, tracking.measurement
     observe_phase(i, columns, tracking.clock, full)
     observe_plan(i, columns, measurement, data.plan, full)
     if columns.goal >= 0:
         x = data.state.goal[i, 0] - measurement.root[i, 0]
         y = data.state.goal[i, 1] - measurement.root[i, 1]
         observe_place(i, columns.goal, x, y, measurement, full)
-    publish(i, tracking.given, tracking.outcome)
+    publish(i, tracking.shown, tracking.outcome)
 
 
 # Loops over simulations; they take packs.

@@ -118,8 +118,8 @@ class Footsteps(PlanTask):
     plans: Any  # Plans or StraightPlans
     hidden_plan = False
 
-    def _bind(self, world: World) -> FootstepData:
-        tracking, n, config = super()._bind(world), world.n, self.config
+    def _bind_body(self, world: World) -> FootstepData:
+        tracking, n, config = super()._bind_body(world), world.n, self.config
         self.plan, self.state = allocated(FootstepPlan, n), allocated(FootstepState, n)
         self.saved = (*self.saved, self.plan, self.state)
         self.info_arrays |= {
@@ -149,7 +149,7 @@ class Footsteps(PlanTask):
 
     # Episodes.
 
-    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+    def _placed(self, env_ids: np.ndarray) -> None:
         plan, state = self.plan, self.state
         self.body.measure(env_ids)
         plan.stance[env_ids] = self.phase[env_ids] >= 0.5
@@ -216,8 +216,8 @@ class SpatialFootsteps(Footsteps):
 
     # Episodes.
 
-    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        super()._begun_on_ground(env_ids)
+    def _placed(self, env_ids: np.ndarray) -> None:
+        super()._placed(env_ids)
         if self.hidden_plan:
             for i in env_ids.tolist():
                 place = self.travel.origin[i, :2]
@@ -283,7 +283,7 @@ class PlanarFootsteps(Footsteps):
 
     terms = PLANAR_TERMS
     CONFIG: Any = PlanarFootstepsConfig
-    tracks = 2
+    clip_parts = 2
 
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         check_feet(character.spec)
@@ -292,8 +292,8 @@ class PlanarFootsteps(Footsteps):
         self._drawn_plans = Plans(**given, width=nothing, turn=0.0, sharp=0.0)
         return CONTACT, PLAN, GOAL.observed_if(False)
 
-    def _track(self) -> Reference:
-        reference = super()._track()
+    def _make_reference(self) -> Reference:
+        reference = super()._make_reference()
         shares, columns = np.arange(32) / 32, reference.columns['effectors']
         halves = [reference.features(shares, np.full(32, half))[:, columns] for half in (0, 1)]
         # Right above left foot, by halves.

@@ -53,7 +53,7 @@ def compare(i: int, data: TrackingData) -> None:
 @compiled
 def observe(i: int, data: TrackingData) -> None:
     """Writes the blocks after those of the body: phase or reference, and the goal."""
-    columns, full = data.given.columns, data.given.full
+    columns, full = data.shown.columns, data.shown.full
     observe_phase(i, columns, data.clock, full)
     if columns.reference >= 0:
         tracks, features = data.comparison.tracks, data.comparison.columns
@@ -65,7 +65,7 @@ def observe(i: int, data: TrackingData) -> None:
     if columns.goal >= 0:
         aside = data.travel.origin[i, 1] - data.measurement.root[i, 1]
         observe_place(i, columns.goal, GOAL_AHEAD, aside, data.measurement, full)
-    publish(i, data.given, data.outcome)
+    publish(i, data.shown, data.outcome)
 
 
 def motion_blocks(character: Character, reference: bool) -> tuple[Block, ...]:

@@ -131,10 +131,10 @@ def compare(i: int, data: DirectData) -> None:
 def observe(i: int, data: DirectData) -> None:
     """Writes the blocks after those of the body: phase, goal and ball."""
     tracking = data.tracking
-    columns, full, measurement = tracking.given.columns, tracking.given.full, tracking.measurement
+    columns, full, measurement = tracking.shown.columns, tracking.shown.full, tracking.measurement
     observe_phase(i, columns, tracking.clock, full)
     observe_goal(i, columns, data.physics, measurement, data.aims, full)
-    publish(i, tracking.given, tracking.outcome)
+    publish(i, tracking.shown, tracking.outcome)
 
 
 # Loops over simulations; they take packs.
@@ -240,11 +240,11 @@ class DirectNavigation(GoalTask, TrackingTask):
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
         return BALL_GOAL if self.ball else GOAL, BALL.observed_if(self.ball is not None)
 
-    def _bind(self, world: World) -> DirectData:
-        tracking, aims = super()._bind(world), self._bind_goals(world, SPEED)
+    def _bind_body(self, world: World) -> DirectData:
+        tracking, aims = super()._bind_body(world), self._bind_goals(world, SPEED)
         return DirectData(tracking, self.body.data.physics, aims)
 
-    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+    def _placed(self, env_ids: np.ndarray) -> None:
         self._begin_goals(env_ids)
         if self.ball:
             self.ball.state.begin[env_ids] = self.ball.place[env_ids]

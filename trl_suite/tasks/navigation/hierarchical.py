@@ -204,7 +204,7 @@ class HierarchicalNavigation(Planned, GoalTask):
     def made_of(self) -> dict[str, tuple[str, Any]]:
         return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
 
-    def _bind(self, world: World) -> rules.PlanningData:
+    def _bind_body(self, world: World) -> rules.PlanningData:
         n, blocks = world.n, self._controller_blocks
         self.plan, self.state = allocated(FootstepPlan, n), allocated(rules.PlanningState, n)
         self.saved = (*self.saved, self.plan, self.state)
@@ -237,7 +237,7 @@ class HierarchicalNavigation(Planned, GoalTask):
 
     # Episodes.
 
-    def _start(
+    def _draw_start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
@@ -250,7 +250,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         poses, rates = pose_of_step(self.steps, self._first, self.phase[env_ids])
         return poses, rates, self.travel.origin[env_ids]
 
-    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+    def _placed(self, env_ids: np.ndarray) -> None:
         plan = self.plan
         for array in (*self.state, plan.landing_error, plan.heading_error, plan.landed):
             array[env_ids] = 0
@@ -279,7 +279,7 @@ class HierarchicalNavigation(Planned, GoalTask):
         while len(going):
             if self.interface == 'plan':
                 self._joint_action[going] = self.controller(self._controller_observation[going])
-            self.body.control(going, self._joint_action)
+            self.body.apply_action(self._joint_action, going)
             self.world.step(self.config.substeps, going)
             count = rules.finish_control_steps(going, self._pack)
             if self.watch is not None:

@@ -152,7 +152,7 @@ class Walk(BodyTask):
         self.action_map = self.joint_map
         self.observed = *self.body.blocks, TARGET_HEADING.observed_if(self._spatial)
 
-    def _bind(self, world: World) -> WalkData:
+    def _bind_body(self, world: World) -> WalkData:
         body = self.body
         body.bind(world, self.action_map, self.outcome.observation, self.observed)
         self._pose, self._extents = self._posture(world)
@@ -186,7 +186,7 @@ class Walk(BodyTask):
         data = world.posed(body.pose_qpos, pose)
         return pose, link_extents(world.models[0], data, body.geoms, np.zeros(2))
 
-    def _start(
+    def _draw_start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
