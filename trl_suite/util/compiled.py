@@ -53,6 +53,7 @@ import numpy as np
 from trl_suite.util import files, interrupts
 
 UNUSED = 30 * 86400.0  # s; machine code of other source versions unused for longer is removed
+_AS_PYTHON = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
 
 
 class Compiled:
@@ -115,14 +116,16 @@ class Compiled:
         return (self._made.get(True) or self._make(True))(*args)
 
 
-def compiled(function: Callable[..., Any]) -> Compiled:
+def compiled(function: Callable[..., Any], inline: bool = False) -> Any:
     """Decorates a function of one simulation, or a loop over simulations."""
-    return Compiled(function)
+    if _AS_PYTHON:  # so that a debugger steps from function to function, in classes as well
+        return staticmethod(function)
+    return Compiled(function, inline=inline)
 
 
-def compiled_inline(function: Callable[..., Any]) -> Compiled:
+def compiled_inline(function: Callable[..., Any]) -> Any:
     """Decorates a small function that other compiled functions call in inner loops."""
-    return Compiled(function, inline=True)
+    return compiled(function, inline=True)
 
 
 @compiled_inline
