@@ -1,5 +1,6 @@
 """Tests of determinism: seeds across processes, save and restore, pickling."""
 
+import collections
 import dataclasses
 import hashlib
 import os
@@ -16,6 +17,7 @@ from helpers import EVERY_PROPERTY, LONG, advance, assert_rows_are_singles
 
 from trl_suite import motion, suite
 from trl_suite.characters import CHARACTERS
+from trl_suite.environments import states
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
 from trl_suite.tasks import parts
@@ -396,6 +398,17 @@ class SignatureTest(parameterized.TestCase):
                     target.set_state(state)
                 self.assertEqual(pickle.dumps(target.get_state()), before)
                 self.build(**one).set_state(state)
+
+    def test_states_of_a_task_that_saves_other_arrays(self):
+        environment = self.build()
+        before, (*others, last) = states.signature(environment.task, 'kind'), environment.task.saved
+        names = tuple(f'other_{name}' for name in last._fields)
+        renamed = collections.namedtuple('Other', names)(*last)
+        smaller = last._replace(**{last._fields[0]: last[0].astype(np.float32)})
+        for saved in ((*others,), (*others, last, last), (*others, renamed), (*others, smaller)):
+            environment.task.saved = saved
+            after = states.signature(environment.task, 'kind')
+            self.assertRegex(states.differences(before, after), '^task .* instead of ')
 
     def test_other_functions_of_one_name(self):
         def ground(height):

@@ -308,7 +308,9 @@ class Task(composer.Task):
         actions = self.action_map
         # In single precision: computed numbers depend on the type of processor.
         numbers = np.array([actions.action_offset, actions.action_scale], np.float32)
-        contents = label, type(self), actions.names, numbers
+        arrays = [[(array.dtype.str, *array.shape[1:]) for array in part] for part in self.saved]
+        fields = [getattr(part, '_fields', ()) for part in self.saved]
+        contents = label, type(self), actions.names, numbers, arrays, fields
         found: dict[str, tuple[str, Any]] = {'task': (label, contents)}
         config = getattr(self, 'config', None)
         found['options'] = type(config).__name__, config
