@@ -58,7 +58,7 @@ OPTIONS = (  # an id or the arguments of `suite.combine`, options; beside those 
         'start_phase': ((0.1, 0.2), (0.6, 0.9)), 'spawn': 'upstream',
     }),
     ('PD_Biped2D_Gaps_Terrain-v0', {
-        'terrain_observation': 0, 'action_offset': 'original', 'action_scale': 0.7, 'time_limit': 0.3,
+        'terrain_observation': 0, 'action_offset': 'original', 'time_limit': 0.3,
     }),
     ('MTU_Biped2D_LLC_Imitate_Flat-v0', {'reference_observation': False, 'terrain_observation': 50}),
     ('MTU_Raptor2D_LLC_Imitate_Flat-v0', {'muscle_set': 'run', 'substeps': 20}),
