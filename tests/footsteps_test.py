@@ -212,6 +212,22 @@ class PlanTest(parameterized.TestCase):
             stances.append(stance)
         self.assertEqual(stances, [LEFT, RIGHT] * 6)
 
+    @parameterized.parameters((0.4, {}), (1.0, {'turn': 0.0, 'sharp': 0.0}))
+    def test_plans_react(self, react, plans):
+        # The walkers stand still, so that they miss landing places.
+        environments, found = walked(4, 6, plans={'react': react, **plans})
+        feet = environments.task.body.measure().feet
+        self.assertGreater(np.abs(found[0][2][:, 0] - found[0][0][:, 1]).min(0)[0], 0.1)
+        for landing, _, after, headings, stance in found:
+            missed = (feet[:, stance] - landing[:, 0])[:, :2]
+            expected = landing[:, 1, :2] + react * missed
+            np.testing.assert_allclose(after[:, 0, :2], expected, atol=1e-12)
+            sizes = length_and_width(after[:, 0], after[:, 1], headings, stance)
+            np.testing.assert_allclose(sizes, [[0.5] * 4, [0.15] * 4], atol=1e-9)
+            if react == 1:
+                sizes = length_and_width(feet[:, stance], after[:, 0], headings, 1 - stance)
+                np.testing.assert_allclose(sizes, [[0.5] * 4, [0.15] * 4], atol=1e-9)
+
     @parameterized.parameters(
         ({}, 0.1, 0.25), ({'sharp': 1.0}, 1.0, 0), ({'sharp': 0.0, 'turn': 0.1}, 0, 0.1)
     )
@@ -276,12 +292,10 @@ class PlanTest(parameterized.TestCase):
         *(('biped2d_full', name) for name in ('slopes_humanoid', 'gaps_humanoid')),
     )
     def test_places_lie_on_the_ground(self, character, preset):
-        environment = suite.build(
-            character,
-            terrain=preset,
-            task='footsteps',
-            task_kwargs={'random': 4, 'step_limit': None, 'start_phase': 0.4},
-        )
+        options = {'random': 4, 'step_limit': None, 'start_phase': 0.4}
+        if character == 'biped3d_mocap':
+            options['plans'] = {'react': 1.0}
+        environment = suite.build(character, terrain=preset, task='footsteps', task_kwargs=options)
         task = environment.task
 
         def height(x, y):
@@ -685,7 +699,7 @@ REFUSED = (
     (PLANAR, {'plans': {'width': (0.1, 0.2)}}, "unknown option of plans 'width'"),
     *((GENERAL, {'plans': {name: value}}, message) for name, value, message in (
         ('width', (-0.1, 0.2), 'width is'), ('width', (0.1, np.inf), 'width is'), ('sharp', -0.1, 'sharp is -0.1'),
-        ('from_root', np.nan, 'from_root is nan'), ('turn', -1, 'turn is -1'),
+        ('from_root', np.nan, 'from_root is nan'), ('react', 1.5, 'react is 1.5'), ('turn', -1, 'turn is -1'),
         ('lenght', 0.5, "unknown option of plans 'lenght'; did you mean 'length'"),
     )),
     (GENERAL, {'plans': np.zeros((2, 2))}, r'plans is array\(\[\[0'),

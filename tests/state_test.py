@@ -113,7 +113,7 @@ OWN = {  # of users
 VARIANTS = (
     (STEP2D, {'plans': {'length': (0.25, 0.6), 'change': 1.0}, 'max_landing_error': 0.5}),
     (TRAIL, {'terrain_observation': 'height'}),
-    (STEP3D.format('Symetric'), {'plans': {'from_root': 0.5}}), ('PD_Biped3D_FULL_Imitate-Steps-v0', {}),
+    (STEP3D.format('Symetric'), {'plans': {'from_root': 0.5, 'react': 0.7}}), ('PD_Biped3D_FULL_Imitate-Steps-v0', {}),
     (STEP3D.format('Bumps'), {'mirrored': True, 'terrain_observation': 'height', 'pushes': {}}),
     (GENERAL, {'goal': True, 'mirrored': True, 'max_landing_error': 0.3}),
     *((suite.combine('biped3d_mocap', None, ground, 'footsteps'), {'terrain_observation': 'height'})

@@ -161,6 +161,8 @@ def _plans(task: Any) -> list[str]:
         lines.append(
             f'with probability {plans.from_root:g} the plan is relative to position and heading of the root'
         )
+    if plans.react:
+        lines.append(f'at a landing, the plan moves by {plans.react:g} of the landing error')
     push = task.config.pushes
     if push is not None:
         (low, high), unit = (push.speed, 'm/s') if push.force is None else (push.force, 'N')

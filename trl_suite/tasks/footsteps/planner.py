@@ -40,7 +40,7 @@ class Plans(Config):
 
     At every switch of stance, the second landing place of the old plan becomes the first of the new
     one. The new second place is displaced from it by the length of a step along the planned
-    heading, and by its width to the side of the foot.
+    heading, and by its width to the side of the foot. With `react`, both follow the foot that landed.
     """
 
     length: Range = option(Range(0.5, 0.5), 'length of a step', unit='m', at_least=0)
@@ -73,6 +73,13 @@ class Plans(Config):
         f'standard deviation of its turn from the current heading; clipped to +-{ROOT_TURN_LIMIT}',
         unit='rad',
         at_least=0,
+    )
+    react: float = option(
+        0.0,
+        'share of the landing error by which a plan moves with the walker at each landing: 0, landing '
+        'places stand still in the world; 1, they are relative to where the foot landed',
+        at_least=0,
+        at_most=1,
     )
 
 
@@ -123,6 +130,10 @@ class PlanTask(Planned, TrackingTask):
             plan.heading[i] = measurement.heading[i] + turn
             self._lay_both(i, measurement.feet[i, stance, :2], (first, second))
             return
+        if plans.react:
+            error = measurement.feet[i, stance, :2] - plan.landing[i, 0, :2]
+            plan.landing[i, :, :2] += plans.react * error
+            plan.landing[i, 1, 2] = self.body.heights(np.array([i]), plan.landing[i, 1:, :2])[0]
         if self.goal_given:
             root, goal = measurement.root[i, :2], self.state.goal
             if np.hypot(*(root - goal[i, :2])) < GOAL_REACHED:
