@@ -165,8 +165,11 @@ def _drive_rotations(
 ) -> bool:
     """Writes the rotation vectors of ball joints from angles and axes; see `ActionMap`.
 
+    The last arguments are fields of `by`: what follows a return for an argument that is None is not
+    compiled.
+
     Returns:
-      Whether the actions have these; otherwise, nothing is written, nor compiled.
+      Whether the actions have these; otherwise, nothing is written.
     """
     if angles is None or balls is None or hinges is None:
         return False

@@ -128,7 +128,7 @@ class PlanarArena(composer.Arena):
         start = centre - BEHIND
         heights, vertical = strip.window(start - BEFORE, VERTICES)
         if not _fill(env_id, start, heights, vertical, self._ground):
-            return  # as on flat ground: boxes need not move
+            return  # at a reset onto the same ground, e.g. flat: boxes need not move
         tolerance = boxes.TOLERANCE
         surface = heights[BEFORE:], vertical[BEFORE:]
         pieces = boxes.cut(start, *surface, tolerance, _kink(strip))

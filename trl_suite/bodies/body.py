@@ -134,7 +134,7 @@ class BodyData(NamedTuple):
       ctrl: controls of the physics, (n, ...).
       columns: first columns of its blocks in the observation; -1: not observed.
       observation: to which its blocks are written, (n, ...).
-      leaving: whether the body has left its ground window, which must then be moved, (n,).
+      leaving: whether the body has left the middle of its ground window, which must then be moved, (n,).
       diverged: whether the physics has diverged, or the body has left its ground, (n,).
     """
 
@@ -247,7 +247,7 @@ class Body(abc.ABC):
         """Returns the ground of all simulations, for compiled functions."""
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        """Writes the controls of some simulations; moves the windows of ground that their bodies have left.
+        """Writes the controls of some simulations; moves ground windows if necessary.
 
         Args:
           action: actions of all simulations, (n, k), in [-1, 1].

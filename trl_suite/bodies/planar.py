@@ -18,7 +18,7 @@ from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
 
-_UPRIGHT = np.pi / 2  # rad; below this pitch a trunk points forwards
+_QUARTER_TURN = np.pi / 2  # rad; at smaller pitches a trunk faces +x: no cosine is needed
 
 
 class PlanarIds(NamedTuple):
@@ -70,7 +70,7 @@ def measure(i: int, body: BodyData) -> None:
     """Measures a body; x of positions in `pose` and `velocity` is ahead of the trunk."""
     ids, state, ground, out = body.ids, body.physics, body.ground, body.measurement
     pitch = state.qpos[i, ids.qpos[2]]
-    facing = -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
+    facing = -1.0 if abs(pitch) > _QUARTER_TURN and math.cos(pitch) < 0.0 else 1.0
     x, z = state.qpos[i, ids.qpos[0]], state.qpos[i, ids.qpos[1]]
     root = ids.links[0]
     com_x, com_z = state.subtree_com[i, root, 0], state.subtree_com[i, root, 2]
@@ -146,7 +146,7 @@ def has_diverged(i: int, limit: float, body: BodyData) -> bool:
 
 @compiled
 def has_left(i: int, body: BodyData) -> bool:
-    """Returns whether a body has left its ground window, which must be moved."""
+    """Returns whether a body has left the middle of its ground window, which must then be moved."""
     return planar_ground.has_left(i, body.physics.qpos[i, body.ids.qpos[0]], body.ground)
 
 

@@ -107,7 +107,7 @@ class Gait:
         self.state = allocated(GaitState, n, vector=vector, target=angles)
         self.state.vector[:] = vector
         matrix, support = np.zeros((size, size)), np.zeros((4, size))
-        rows = {'torque': angles, 'matrix': matrix, 'vector': np.zeros(size), 'support': support}
+        rows = {'torque': angles, 'matrix': matrix, 'rhs': np.zeros(size), 'support': support}
         scratch = allocated(Scratch, n, **rows)
         physics = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
         mechanics = Mechanics(*(getattr(world, name) for name in Mechanics._fields))

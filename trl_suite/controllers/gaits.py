@@ -106,13 +106,14 @@ class Scratch(NamedTuple):
 
     Attributes:
       torque: joint torques, the result of a control step, (n, J).
-      matrix, vector: systems of linear equations, (n, D, D) and (n, D).
+      matrix, rhs: matrices, (n, D, D), and right-hand sides, (n, D), of linear equations, whose
+        solutions overwrite the latter.
       support: Jacobians of two feet, (n, 4, D).
     """
 
     torque: np.ndarray
     matrix: np.ndarray
-    vector: np.ndarray
+    rhs: np.ndarray
     support: np.ndarray
 
 
@@ -151,8 +152,8 @@ def enter(i: int, gait: GaitData) -> None:
 
 
 @compiled
-def hip_angle(i: int, leg: int, machine: Machine, skeleton: Skeleton, qpos: np.ndarray) -> float:
-    """Returns the world angle of the thigh without the hip's own angle, rad."""
+def thigh_base(i: int, leg: int, machine: Machine, skeleton: Skeleton, qpos: np.ndarray) -> float:
+    """Returns the world angle that the thigh has when the hip's own angle is 0, rad."""
     angle = 0.0
     for k in range(len(skeleton.qpos)):
         angle += qpos[i, skeleton.qpos[k]] * machine.turn[leg, k]
@@ -168,7 +169,7 @@ def write_local_targets(i: int, gait: GaitData, out: np.ndarray) -> None:
     for leg in range(len(machine.legs)):
         hip = machine.legs[leg, 0]
         own = qpos[i, skeleton.qpos[3 + hip]]
-        angle = hip_angle(i, leg, machine, skeleton, qpos) + own
+        angle = thigh_base(i, leg, machine, skeleton, qpos) + own
         angle -= 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))  # to (-pi, pi]
         out[i, hip] -= angle - own
 
@@ -184,23 +185,23 @@ def stable_pd(i: int, free: int, gait: GaitData) -> None:
     """
     skeleton, machine, scratch = gait.skeleton, gait.machine, gait.scratch
     qpos, qvel = gait.physics.qpos, gait.physics.qvel
-    matrix, vector, torque = scratch.matrix, scratch.vector, scratch.torque
-    write_local_targets(i, gait, torque)
+    matrix, rhs, torque = scratch.matrix, scratch.rhs, scratch.torque
+    write_local_targets(i, gait, torque)  # which the loop below replaces by torques
     write_inertia(i, skeleton, gait.mechanics.M, matrix)
     size = len(skeleton.dof)
     for k in range(size):
-        vector[i, k] = -gait.mechanics.qfrc_bias[i, skeleton.dof[k]]
+        rhs[i, k] = -gait.mechanics.qfrc_bias[i, skeleton.dof[k]]
     for k in range(3, size):
         joint = k - 3
         kp, kd, v = machine.kp[joint], machine.kd[joint], qvel[i, skeleton.dof[k]]
         matrix[i, k, k] += GAIT_TIMESTEP * kd
         error = -qpos[i, skeleton.qpos[k]] - GAIT_TIMESTEP * v + torque[i, joint]
         torque[i, joint] = 0.0 if joint == free else kp * error - kd * v
-        vector[i, k] += torque[i, joint]
-    solve(i, size, matrix, vector)
+        rhs[i, k] += torque[i, joint]
+    solve(i, size, matrix, rhs)
     for joint in range(size - 3):
         if joint != free:
-            torque[i, joint] -= machine.kd[joint] * GAIT_TIMESTEP * vector[i, 3 + joint]
+            torque[i, joint] -= machine.kd[joint] * GAIT_TIMESTEP * rhs[i, 3 + joint]
 
 
 @compiled
@@ -269,7 +270,7 @@ def add_weight(i: int, gait: GaitData) -> None:
     """Adds torques that compensate gravity by the feet on the ground."""
     skeleton, scratch = gait.skeleton, gait.scratch
     com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
-    support, grip, force = scratch.support, scratch.matrix, scratch.vector
+    support, grip, force = scratch.support, scratch.matrix, scratch.rhs
     for row in range(4):  # rows: forces that support the root, the first three degrees of freedom
         for column in range(4):
             grip[i, row, column] = 0.0
@@ -363,7 +364,7 @@ def hop_torques(i: int, gait: GaitData) -> None:
         upright = -machine.kp[hip] * pitch - machine.kd[hip] * rate
         torque[i, hip] -= state.vector[i, 0] * upright
     if touches(i, machine.feet[0], gait):
-        thigh = hip_angle(i, 0, machine, skeleton, qpos) + qpos[i, skeleton.qpos[3 + hip]]
+        thigh = thigh_base(i, 0, machine, skeleton, qpos) + qpos[i, skeleton.qpos[3 + hip]]
         torque[i, leg] += machine.lift * math.cos(thigh)
     clip_torques(i, gait)
 

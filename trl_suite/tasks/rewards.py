@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
       reward_terms: weighted terms of the reward, (n, terms); 0 after a reset.
       failed: whether the episode has ended with discount 0, (n,) bool.
       diverged: whether it failed because the physics diverged, (n,) bool.
-      fell: whether it failed for another reason, a fall or a landing error, (n,) bool.
+      fell: whether it failed for another reason: a fall, a landing error or no progress, (n,) bool.
     """
 
     observation: np.ndarray

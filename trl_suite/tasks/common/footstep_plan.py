@@ -127,7 +127,7 @@ def update_stance(i: int, phase: float, measurement: Measurement, plan: Footstep
 def observe_plan(
     i: int, columns: Any, measurement: Measurement, plan: FootstepPlan, observation: np.ndarray
 ) -> None:
-    """Writes the blocks `CONTACT` and `PLAN`; see `Footsteps`."""
+    """Writes the blocks `CONTACT` and `PLAN`."""
     column = columns.plan
     for foot in range(2):
         observation[i, columns.contact + foot] = measurement.contact[i, foot]

@@ -1,7 +1,7 @@
 """Goals on the ground to walk to, or to dribble a ball to, one after the other.
 
-A goal is redrawn when it is reached or its time has expired. Source of the ball: the soccer scenario of
-the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
+A goal is redrawn when its time has expired, and that of a walker also when it is reached. Source of the
+ball: the soccer scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
 """
 
 from __future__ import annotations
@@ -51,11 +51,14 @@ def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
     return tuple(
         Term(name, share * weight, meaning)
         for name, weight, meaning in (
-            ('approach', 0.2 / 1.2, f'{_SPEEDS}, v: speed of the centre of mass towards the ball, m/s'),
+            (
+                'approach', 0.2 / 1.2,
+                f'{_SPEEDS}, v: speed of the centre of mass towards the place of the ball at the end of the step, m/s',
+            ),
             (
                 'near', 0.2 / 1.2,
-                f'exp(-{BALL_SHARPNESS:g} d^2), d: horizontal distance of the ball from the centre of mass at '
-                'the beginning of the step, m',
+                f'exp(-{BALL_SHARPNESS:g} d^2), d: horizontal distance of the ball at the end of the step from the '
+                'centre of mass at its beginning, m',
             ),
             (
                 'dribble', 0.4 / 1.2,
@@ -75,7 +78,8 @@ class Goals(NamedTuple):
     Attributes:
       place: position, (n, 3) m.
       due: control step of the episode at which it is redrawn, (n,).
-      reached: number of goals reached in the episode, (n,).
+      reached: number of goals reached in the episode; with a ball, of steps that ended with it at its
+        goal, (n,).
       wanted: whether it must be redrawn now, (n,).
       walker: position of the walker's centre of mass at the beginning of the step, (n, 3) m.
       speed: speed of walker or ball towards the goal, in the last step, (n,) m/s.
@@ -135,7 +139,7 @@ class GoalData(NamedTuple):
       with_ball: whether the goal is that of a ball.
       qpos, dof: first addresses of the ball's position (7) in qpos and velocity (6) in qvel; -1: none.
       body: its body id.
-      terms: the reward terms of `soccer_terms`.
+      terms: the reward terms, of which `dribble` writes those of `soccer_terms`; unused without a ball.
     """
 
     goals: Goals
@@ -156,7 +160,7 @@ class GoalData(NamedTuple):
 def observe_place(
     i: int, column: int, x: float, y: float, measurement: Measurement, observation: np.ndarray
 ) -> None:
-    """Writes bearing and distance of a place x, y m from the root, in world axes."""
+    """Writes bearing and distance of a displacement x, y m in world axes."""
     bearing, distance = polar(i, x, y, measurement)
     observation[i, column], observation[i, column + 1] = bearing, distance
 
@@ -203,6 +207,7 @@ def dribble(
     walker, begin = data.goals.walker, ball.begin
     x, y = physics.qpos[i, data.qpos], physics.qpos[i, data.qpos + 1]
     z = physics.qpos[i, data.qpos + 2]
+    # As in the original: from the walker at the beginning of the step to the ball at its end.
     gap_x, gap_y = x - walker[i, 0], y - walker[i, 1]
     towards_ball = _speed_along(
         measurement.com[i, 0] - walker[i, 0],

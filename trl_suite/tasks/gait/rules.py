@@ -106,7 +106,7 @@ class GaitTaskData(NamedTuple):
       forward_only: whether moving backwards is a fall.
       backward_reward: whether the reward of a cycle with negative speed can be positive.
       target_speed: m/s.
-      columns: columns of the measurement in the observation, by stance leg, (2, size).
+      sources: columns of `body.observation` that are copied to the observation, by stance leg, (2, size).
       pitch, pitch_rate: columns of the observation for pitch and its rate; -1: not observed.
     """
 
@@ -127,7 +127,7 @@ class GaitTaskData(NamedTuple):
     forward_only: bool
     backward_reward: bool
     target_speed: float
-    columns: np.ndarray
+    sources: np.ndarray
     pitch: int
     pitch_rate: int
 
@@ -215,7 +215,7 @@ def judge(i: int, data: GaitTaskData) -> None:
         state.stuck[i] = moved < PROGRESS
         state.milestone[i, 0], state.milestone[i, 1] = x, z
     diverged = has_diverged(i, MAX_UNDAMPED_SPEED, data.body)
-    data.outcome.diverged[i] = diverged  # keeps the last observation
+    data.outcome.diverged[i] = diverged
     data.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
 
 
@@ -244,8 +244,8 @@ def observe(i: int, data: GaitTaskData) -> None:
     measure(i, data.body)
     observe_body(i, data.body.columns, data.body, measured)
     stance = data.gait.state.stance[i]
-    for k in range(data.columns.shape[1]):
-        observation[i, k] = measured[i, data.columns[stance, k]]
+    for k in range(data.sources.shape[1]):
+        observation[i, k] = measured[i, data.sources[stance, k]]
     if data.pitch >= 0:
         observation[i, data.pitch] = physics.qpos[i, ids.qpos[2]]
         observation[i, data.pitch_rate] = physics.qvel[i, ids.dof[2]]
@@ -318,9 +318,10 @@ def finish_steps(env_ids: np.ndarray, data: GaitTaskData) -> None:
     for i in env_ids:
         state.duration[i] = GAIT_TIMESTEP * state.lasted[i]
         state.stumbling[i] = GAIT_TIMESTEP * state.stumbled[i]
+        # `judge` tests joint speeds, every SAMPLE; here, whether the state can be observed.
         outcome.diverged[i] |= has_diverged(i, math.inf, data.body)
         failed = outcome.failed[i] or outcome.diverged[i]
-        if outcome.diverged[i]:
+        if outcome.diverged[i]:  # keeps the last finite observation
             state.fell[i] = state.stuck[i] = False
         else:
             reward(i, data)

@@ -146,7 +146,7 @@ class GaitTask(Task):
         self._allocate(n, world.qpos[:, body.pose_qpos[0]])
         self.saved = (self.state, gait.state, self.outcome)
         self.info_arrays |= {
-            'fell': self.state.fell,
+            'fell': self.state.fell,  # `outcome.fell` includes `stuck`
             'stuck': self.state.stuck,
             'duration': self.state.duration,
             'stumbled': self.state.stumbling,
@@ -172,15 +172,15 @@ class GaitTask(Task):
             forward_only=parameters.forward_only,
             backward_reward=parameters.backward_reward,
             target_speed=float(parameters.target_speed),
-            columns=self._columns(),
+            sources=self._sources(),
             pitch=self.blocks['pose'].stop - 1 if pitch else -1,
             pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
         )
         self._pack = packed(self.data)
         self._start = self._start_pose()
 
-    def _columns(self) -> np.ndarray:
-        """Returns the columns of the body's blocks in an observation, by stance leg, (2, size)."""
+    def _sources(self) -> np.ndarray:
+        """Returns the columns of the body's blocks that are observed, by stance leg, (2, size)."""
         links, body = self.character.spec.links, self.body.data.columns
         order = np.arange(len(links))
         mirrored = order.copy()

@@ -217,7 +217,8 @@ class HierarchicalNavigation(Planned, GoalTask):
         }
         self._controller_observation = np.zeros((n, sum(block.size for block in blocks)))
         self._joint_action = np.zeros((n, len(self.joint_map)))
-        # The body writes what the controller observes; `rules.observe` writes the planner's blocks.
+        # In a step, `rules.observe_for_controller` writes all of this array; elsewhere, `Body.measure`
+        # the body's blocks. `rules.observe` writes those of the planner.
         self.body.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
         return rules.PlanningData(
             body=self.body.data,

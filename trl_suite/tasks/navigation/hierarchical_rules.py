@@ -82,7 +82,7 @@ class PlanningData(NamedTuple):
       period: that of two footsteps, s.
       controller: the observation of the footstep controller.
       columns: first columns of the blocks of the observation; -1: not observed.
-      terms: the reward terms of a goal.
+      terms: the reward terms of a walker's goal; with a ball, those of `aims` are used.
       by_plan: whether a step is a footstep, not a control step.
       plan_map: the map from actions to plans, in m and rad.
     """
@@ -222,7 +222,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
     """Sets plans where footsteps begin, and writes the footstep controller's observations."""
     body, state = data.body, data.state
     for i in env_ids:
-        measure_walker(i, data)
+        measure_walker(i, data)  # a restored state has no measurement
         lay_plan(i, action, data)
         state.lasted[i] = 0
         store_start(i, body.physics, body.measurement, data.aims)
