@@ -707,6 +707,11 @@ class OptionTest(FolderTest):
             return functools.partial(scripted.scripted, made(id_, **options))
 
         (self.folder / 'broken.npz').write_bytes(b'no')
+        shipped = policies.reference(hierarchical.CONTROLLER)
+        without_plan = policies.Policy(
+            'mine', shipped.blocks[:3], shipped.actions, shipped.quantity, np.zeros(110), np.ones(110), 5.0,
+            (np.zeros((110, 17)),), (np.zeros(17),), 'tanh', np.zeros(17),
+        )  # fmt: skip
         assert_refused(
             self,
             *((lambda i=i, o=o: suite.make(i, o), m) for i in (FOREST, SOCCER) for o, m in REFUSED),
@@ -723,6 +728,8 @@ class OptionTest(FolderTest):
              f"did you mean '{hierarchical.CONTROLLER}'"),
             (lambda: started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0'),
              "policy of 'FSM_Goat2D.*' observes .*plan 13"),
+            (lambda: started(PLANE, controller=without_plan),
+             'observes pose 57, velocity 48, phase 5; the environment gives .*contact 2, plan 13'),
             (lambda: footstep_controller.load(str(self.folder / 'broken.npz')), 'broken.npz'),
         )  # fmt: skip
         ball('flat3d')().close()

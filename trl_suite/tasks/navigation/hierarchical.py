@@ -163,15 +163,10 @@ class HierarchicalNavigation(Planned, GoalTask):
         self.terms = soccer_terms() if ball else rules.NAVIGATION_TERMS
         super().__init__(character, arena, steps, config, actuation_model)
         self.controller = footstep_controller.load(config.controller)
-        policy = self.controller.policy
-        blocks = *self.body.blocks, PHASE, CONTACT, PLAN
-        if policy is not None and {(b.name, b.size) for b in blocks}.issuperset(policy.blocks):
-            # It may have been trained without some of them.
-            blocks = tuple(block.observed_if(block.name in dict(policy.blocks)) for block in blocks)
-        self._controller_blocks: tuple[Block, ...] = blocks
+        self._controller_blocks: tuple[Block, ...] = (*self.body.blocks, PHASE, CONTACT, PLAN)
         self.controller.check(character.spec, layout(self._controller_blocks), self.joint_map)
         # A custom function is called on one thread, for all simulations together.
-        self.in_parts = policy is not None
+        self.in_parts = self.controller.policy is not None
         self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
