@@ -99,7 +99,7 @@ class PlanarArena(composer.Arena):
     def height(self, x: np.ndarray, env_ids: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (simulations, k) m, linear between the vertices.
 
-        Exact within 18 m of the centre of a window; characters are within 3 m of it.
+        Exact within 18 m of the centre of a window; characters are within about 3 m of it.
         """
         env_ids, x = self._world.all_ids[env_ids], np.ascontiguousarray(x, float)
         if x.ndim != 2 or len(x) != len(env_ids):

@@ -250,7 +250,7 @@ class Body(abc.ABC):
         """Writes the controls of some simulations; moves ground windows if necessary.
 
         Args:
-          action: actions of all simulations, (n, k), in [-1, 1].
+          action: actions of all simulations, (n, k), which are clipped to [-1, 1].
           env_ids: indices of simulations.
         """
         if self.control_all(env_ids, action, self.pack):

@@ -90,7 +90,10 @@ class SpatialState(NamedTuple):
 
 @compiled
 def measure(i: int, body: BodyData) -> None:
-    """Measures a body, relative to the current ground."""
+    """Measures a body: pose and velocity in the heading frame, heights above the current ground.
+
+    Quaternions have w >= 0; velocities of centres are relative to the ground under the root.
+    """
     ids, state, ground, out = body.ids, body.physics, body.ground, body.measurement
     spatial_ground.see_movers(i, state.qpos, ground)
     root = ids.links[0]
@@ -101,7 +104,7 @@ def measure(i: int, body: BodyData) -> None:
     y, z = state.xquat[i, root, 2], state.xquat[i, root, 3]
     heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     cosine, sine = math.cos(heading), math.sin(heading)
-    half_cosine, half_sine = math.cos(0.5 * heading), -math.sin(0.5 * heading)
+    half_cosine, half_sine = math.cos(0.5 * heading), -math.sin(0.5 * heading)  # of -heading
     under = spatial_ground.height(i, root_x, root_y, ground)
     drift_x = drift_y = 0.0  # velocity of the ground under the root, m/s
     if ground.box_velocity.shape[1] + ground.mover_top.shape[1] > 0:
@@ -349,7 +352,7 @@ class SpatialBody(Body):
 
 
 def body_blocks(character: Character, terrain_observation: bool) -> tuple[Block, ...]:
-    """Returns the blocks terrain, pose and velocity of a character, as `measure` gives them."""
+    """Returns the blocks terrain, pose and velocity of a character, as `observe_body` writes them."""
     spec = character.spec
     names = list(spec.links)
     links = exchanged(len(names), [(names.index(a), names.index(b)) for a, b in spec.mirror])

@@ -271,7 +271,9 @@ def add_weight(i: int, gait: GaitData) -> None:
     skeleton, scratch = gait.skeleton, gait.scratch
     com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
     support, grip, force = scratch.support, scratch.matrix, scratch.rhs
-    for row in range(4):  # rows: forces that support the root, the first three degrees of freedom
+    # Least squares for the forces f of the feet that hold the root, its three degrees of freedom:
+    # (J J' + REGULARISATION) f = -J w, with J `support` and w gravity.
+    for row in range(4):
         for column in range(4):
             grip[i, row, column] = 0.0
             for k in range(3):

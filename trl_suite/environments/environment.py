@@ -337,7 +337,7 @@ class Environment(composer.Environment):
                 return self.reset()
             if self._has_own_observables:
                 self._observation_updater.prepare_for_next_control_step()
-            if self._hooked:
+            if self._hooked:  # by way of `Task.before_step` and `after_step`: the same as `advance`
                 self._hooks.before_step(physics, action, self._random_state)
                 task.simulate(core.world.all_ids)
                 self._hooks.after_step(physics, self._random_state)

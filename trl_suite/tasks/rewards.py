@@ -234,7 +234,7 @@ def comparison(character: Character, reference: Reference, terms: tuple[Term, ..
     )
 
 
-# Functions of simulation i and a row and remainder of the reference table (see `moment`).
+# Functions of simulation i and a row and fraction of the reference table (see `moment`).
 
 
 @compiled

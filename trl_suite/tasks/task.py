@@ -66,12 +66,13 @@ class Task(composer.Task):
        or, where a controller drives the joints, sets the plan or the gait that it follows;
     2. `simulate`: advances the physics;
     3. `finish_step`: checks for divergence, measures the body, updates the clock, and computes
-       reward, failure and observation, in this order.
+       reward, failure and observation, in this order; where a controller drives the joints,
+       `simulate` does the first of these in each of its control steps.
 
     Several threads call `reset` and `step`, each for some of the simulations. A call may change
     only the simulations that it is given. The composer hooks below call the same methods for one
-    simulation, so that a plain `composer.Environment` can run the task, unless its steps vary in
-    duration; such a task overrides `simulate`.
+    simulation, so that a plain `composer.Environment` can run the task, unless it overrides
+    `simulate`, as tasks with a controller do.
 
     Attributes:
       world: the simulations; set by `bind`.
@@ -127,7 +128,7 @@ class Task(composer.Task):
         """Applies the actions of some simulations.
 
         Args:
-          action: actions of all simulations, (n, k), in [-1, 1].
+          action: actions of all simulations, (n, k), finite, not yet clipped to [-1, 1].
           env_ids: ids of the simulations whose actions are applied.
         """
 
@@ -227,7 +228,7 @@ class Task(composer.Task):
         """Advances some simulations by one step.
 
         Args:
-          action: actions of all simulations, (n, k), in [-1, 1]; those of the others are ignored.
+          action: actions of all simulations, (n, k), finite; those of the others are ignored.
           env_ids: sorted indices of the simulations that take a step.
         """
         self.apply_action(action, env_ids)

@@ -157,7 +157,9 @@ class BodyTask(Task):
             array[env_ids] = 0
         self._placed(env_ids)
         self.observe(env_ids)
-        self.outcome.reward_terms[env_ids] = 0.0  # `observe_all` wrote those of the start
+        self.outcome.reward_terms[env_ids] = (
+            0.0  # `observe_all` may have written those of the start
+        )
 
     def _begin_clocks(self, env_ids: np.ndarray) -> None:
         """Sets the clocks of some simulations to `clock.start`."""

@@ -29,7 +29,7 @@ from trl_suite.tasks.rewards import (
 from trl_suite.util.compiled import compiled
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
-SUBSTEPS = 2  # physics steps per control step: 1/1200 s
+SUBSTEPS = 2  # physics steps, of 1/1200 s, per control step of 1/600 s
 FRAME = 1 / 30  # s; nominal step, and the actual one with interface 'base_action'
 LONGEST_CYCLE = 50  # frames
 UPSTREAM_CENTRE = 3.0  # m; boundary of the original's first two segments of ground
@@ -254,7 +254,7 @@ def observe(i: int, data: GaitTaskData) -> None:
 def observed_blocks(
     measured: tuple[Block, ...], spec: CharacterSpec, parameters: Parameters
 ) -> tuple[Block, ...]:
-    """Returns the blocks that `observe` writes, from those that `measure` writes."""
+    """Returns the blocks that `observe` writes, from those that `observe_body` writes."""
     terrain, pose, velocity, _ = measured
     stance = '; the stance leg first, then the swing leg' if spec.mirror else ''
     pitch = stance or '; the last z is replaced by the pitch of the root (rad)'

@@ -56,7 +56,7 @@ class PlanningState(NamedTuple):
     """State of the task in addition to plan and goal, (n, ...).
 
     Attributes:
-      lasted: number of control steps in the last step.
+      lasted: number of control steps so far in this step.
       duration: duration of the last step, s.
       down: decaying average of samples with a fall link on the ground.
       over: whether the step is over.
