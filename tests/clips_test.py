@@ -38,6 +38,15 @@ SPATIAL = {
 }  # fmt: skip
 LIBRARIES = {'biped3d_mocap': 27, 'biped3d_full_mocap': 27, 'biped3d_mocap_run': 1}
 WALKS = ('biped3d_mocap', 'biped3d_full_mocap')
+# Height of the hip above the knee in swing, its least value, m; largest flexion of the knee in swing,
+# rad; mean forward lean of the trunk, rad; longest step, m.
+STYLES = {
+    '': (0.35, 1.16, 0.02, 0.7),
+    '_high_knees': (0.27, 1.73, 0.02, 0.7),
+    '_straight_legs': (0.38, 0.52, 0.02, 0.7),
+    '_forward_lean': (0.335, 1.2, 0.45, 0.7),
+    '_in_place': (0.375, 0.93, 0.02, 0.1),
+}
 DEEPEST = 0.01  # m below the ground
 SLIDE = 0.02  # m a planted foot may travel
 
@@ -148,6 +157,27 @@ class LibraryTest(parameterized.TestCase):
             self.assertGreaterEqual(report.margin[0], 0.01, report.margin[1])
             self.assertLess(report.overlap, checks3d.DEEP, i)
             self.assertEqual(report.planted > 0.95, name in WALKS, i)
+
+    @parameterized.parameters(*STYLES.items())
+    def test_styles(self, style, expected):
+        library, model = motion.load_steps(f'biped3d_mocap{style}'), figure3d.model('biped3d_mocap')
+        for i in range(len(library)):
+            report = checks3d.measure(library.clip(i), 'biped3d_mocap', 121)
+            self.assertGreater(report.lowest, -DEEPEST, i)
+            self.assertLess(report.slide, SLIDE, i)
+            self.assertGreaterEqual(report.margin[0], 0.01, report.margin[1])
+            self.assertLess(report.overlap, checks3d.DEEP, i)
+        usual = int(np.argmin(np.abs(library.labels - library.previous).sum(axis=1)))
+        clip, data, found = library.clip(usual), mujoco.MjData(model), []
+        for t in np.linspace(0, clip.duration, 41):
+            data.qpos[checks3d.place(model, clip)] = clip.pose(t)
+            mujoco.mj_kinematics(model, data)
+            hip, knee = (data.body(f'left_{name}').xpos[2] for name in ('hip', 'knee'))
+            lean = np.arcsin(data.body('torso').xmat[2])
+            found.append((hip - knee, -float(data.joint('left_knee').qpos[0]), lean))
+        least, most, mean = (reduce(found, 0) for reduce in (np.min, np.max, np.mean))
+        measured = least[0], most[1], mean[2], library.labels[:, 0].max()
+        np.testing.assert_allclose(measured, expected, atol=0.02)
 
     @parameterized.product(name=tuple(LIBRARIES), mirrored=(False, True))
     def test_lands_as_labelled(self, name, mirrored):

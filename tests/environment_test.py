@@ -122,7 +122,9 @@ def every_environment(id_):
             self.assertEqual(task.character.spec.name, spec.character)
             self.assertEqual(getattr(task, 'actuation_model', 'gait'), spec.actuation)
             motion = getattr(task, 'motion', getattr(task, 'clip', None))
-            self.assertEqual(motion and motion.name, spec.clip)
+            style = spec.options.get('style')
+            expected = spec.clip if style is None else f'{spec.clip}_{style}'
+            self.assertEqual(motion and motion.name, expected)
             stop, shapes = 0, environment.observation_spec()
             self.assertEqual(list(shapes), list(environment.blocks))  # terrain first
             for name, part in environment.blocks.items():

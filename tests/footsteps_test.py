@@ -437,6 +437,22 @@ class RewardTest(parameterized.TestCase):
             found = task.reward_terms[0, 2]
             self.assertAlmostEqual(found, WEIGHTS['end_effector'], delta=1e-3)
 
+    @parameterized.parameters('high_knees', 'straight_legs', 'forward_lean', 'in_place')
+    def test_a_style_is_another_reference(self, style):
+        plain, _ = self.placed(GENERAL, 0.24)
+        environment, _ = self.placed(GENERAL, 0.24, style=style, pose_scale=10.0)
+        task, maps = environment.task, (plain.action_map, environment.action_map)
+        np.testing.assert_array_equal(*(mapped.action_offset for mapped in maps))
+        for found, (name, weight) in zip(task.reward_terms[0], WEIGHTS.items(), strict=True):
+            self.assertAlmostEqual(found, weight, delta=0.02 * weight, msg=name)
+        environment.physics.named.data.qpos['biped3d_mocap/left_knee'] -= 0.25
+        environment.physics.forward()
+        task.observe()  # the knee's weight is 0.3 of 3.5
+        expected = WEIGHTS['pose'] * np.exp(-10 * 2 * 0.3 / 3.5 * 0.25**2)
+        self.assertAlmostEqual(task.reward_terms[0, 0], expected, delta=0.02 * WEIGHTS['pose'])
+        poses = [made.task.reference_pose(0) for made in (plain, environment)]
+        self.assertGreater(np.abs(poses[0] - poses[1]).max(), 0.1)
+
     @parameterized.parameters(
         *((id_, phase, scale) for phase in (0.4, 0.77) for id_, scale in (
             (GENERAL, 1.0), (GENERAL, 5.0), (GENERAL, (1.5, 8.0)), (PLANAR, 1.0), (PLANAR, 4.0)))
@@ -706,6 +722,7 @@ REFUSED = (
     (GENERAL, {'pushes': {'power': 1}}, "unknown option of pushes 'power'"),
     (GENERAL, {'pushes': {'force': (3, 2)}}, 'force is'), (GENERAL, {'grace_period': -1}, 'grace_period is -1'),
     (GENERAL, {'footstep_scale': ()}, 'footstep_scale is '), (GENERAL, {'heading_scale': -1}, 'heading_scale is -1'),
+    (GENERAL, {'style': 'high_knee'}, "'biped3d_mocap_high_knee'; did you mean 'biped3d_mocap_high_knees'"),
     (GENERAL, {'footstep_scale': (1, np.inf)}, r'footstep_scale is \(1, inf'),
 )  # fmt: skip
 

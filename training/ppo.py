@@ -179,6 +179,8 @@ class Trainer:
             )
         networks.begin_with(other, self.policy, self.scales, self.places, s.start_count)
         self.log_std.data.copy_(torch.from_numpy(other.log_std.copy()))
+        if s.start_std is not None:
+            self.log_std.data.fill_(float(np.log(s.start_std)))
 
     # Simulation.
 

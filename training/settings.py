@@ -80,6 +80,7 @@ class Settings:
     # Sample count of the scales of the initial policy. With a small count they adapt quickly to the
     # new environment, but the initial weights may then no longer fit the scales.
     start_count: float = 2e4
+    start_std: float | None = None  # noise of the initial policy; None: its own
     cloned: float = 1e4
     # Rounds of imitation. After the first round the policy selects the actions, and the teacher
     # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
@@ -285,6 +286,34 @@ STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgettin
     **FOOTSTEPS, 'samples': 1e6, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'stages': ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),),
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
+}  # fmt: skip
+# Styles: mostly without disturbances, in which a policy that survives has no reason to change.
+STYLED = {
+    **FOOTSTEPS, 'samples': 1.5e6, 'num_envs': 64, 'minibatch': 512, 'averaged': 1e5,
+    'start': 'PD_Biped3D_LLC_General_Step-v0', 'start_std': 0.12, 'value_first': 6e4,
+    'learning_rate': 3e-4, 'last_learning_rate': 3e-5,
+    'landing_costs': {'landing_error': 8.0, 'heading_error': 2.0},
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.02}}, {'plans': {**FREE, 'sharp': 0.02}}, EVEN,
+            {'plans': {**BY_ROOT, 'sharp': 0.0}}, {'plans': {**BY_ROOT, 'root_turn': 0.6}},
+            {'plans': {'sharp': 0.1}}, PLACES, {'plans': FREE, 'pushes': pushes(60, 160)},
+        ),
+        footstep_scale=5.0, heading_scale=2.0,
+    ),
+}  # fmt: skip
+SHORT = {'length': (0.0, 0.1), 'change': 1.0, 'turn': 0.2}
+IN_PLACE = {
+    **STYLED,
+    'stages': together(
+        (
+            {'plans': {**SHORT, 'sharp': 0.05}},
+            {'plans': {**SHORT, 'sharp': 0.1}, 'pushes': pushes(60, 160)},
+            {'plans': {**BY_ROOT, 'root_length': (0.0, 0.1), 'root_turn': 0.6}},
+            {'plans': {**SHORT, 'change': 0.0, 'turn': 0.0, 'sharp': 0.0}},
+        ),
+        footstep_scale=10.0, heading_scale=2.0,
+    ),
 }  # fmt: skip
 # Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
 # of the footstep controller, before it was averaged with the second.
@@ -494,6 +523,8 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     ('PD_Biped3D_LLC_Bumps_Step-v0', STEPS_ON),
     ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
+    *((f'PD_Biped3D_LLC_{name}_Step-v0', STYLED) for name in ('HighKnees', 'StraightLegs', 'ForwardLean')),
+    ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
     # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),

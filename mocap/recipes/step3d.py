@@ -22,8 +22,8 @@ from trl_suite import motion
 
 STEP = 0.5  # s
 REFERENCE = 0.65  # m, the step length to which the parameters of `SHAPES` refer
-LIST, ROTATION, TOE_OUT = 0.07, 0.10, 0.08  # rad: pelvis dropped and turned, feet turned out
-LEAN, TORSO_LEAN, COUNTER = -0.05, -0.02, 1.0  # rad, rad, counter-turn of the torso per pelvis's
+ROTATION, TOE_OUT = 0.10, 0.08  # rad: pelvis turned, feet turned out
+COUNTER = 1.0  # counter-turn of the torso per pelvis's
 CLEARANCE = 0.12  # m, by which the swing foot passes the stance foot
 SPARE = 0.0025  # m, largest error of the stance foot; if the leg is shorter, the pelvis sinks
 PASSES = 4  # in which it does
@@ -65,8 +65,26 @@ _ROWS = {
         *(0.253, 0.740, -0.299, -5.0, 0.2, -1.003, 0.771, 0.183, 0.10, 0.182, 1.501),
     ),
 }
+# Pitch of pelvis and torso, drop of the pelvis on the swing side, rad; detour of the swing foot, m.
+_POSTURE = {'lean': -0.05, 'torso': -0.02, 'list': 0.07, 'aside': 0.0}
 SHAPES: Mapping[str, Mapping[str, float]] = {
-    name: dict(zip(NAMES, row, strict=True)) for name, row in _ROWS.items()
+    name: dict(zip(NAMES, row, strict=True)) | _POSTURE for name, row in _ROWS.items()
+}
+# What the steps of a style have instead.
+STYLES: Mapping[str, Mapping[str, float]] = {
+    'high_knees': {'lift': 0.28},
+    'straight_legs': {
+        'phl': 0.10,
+        'pht': 0.12,
+        'phm': 0.10,
+        'tto': -0.4,
+        'tmid': 0.3,
+        'lift': 0.08,
+        'aside': 0.28,
+        'list': 0.0,
+    },
+    'forward_lean': {'lean': -0.20, 'torso': -0.45, 'xoff': -0.03},
+    'in_place': {'xoff': 0.0},
 }
 
 
@@ -110,7 +128,9 @@ def node(
     velocity = p['kap'] * forward / STEP * e + p['c'] * np.clip(outward, 0, 0.3) * n
     # The lead hip is turned forward; the root is as high as the shorter leg lets it.
     leg = sum(made.leg)
-    turn = figure3d.yaw(np.array(heading - side * ROTATION * size)) @ figure3d.pitch(np.array(LEAN))
+    turn = figure3d.yaw(np.array(heading - side * ROTATION * size)) @ figure3d.pitch(
+        np.array(p['lean'])
+    )
     heights = [sole + leg * np.cos(p['phm'] / 2) - 0.005]
     for foot, bend, tilt, corner, lateral in (
         (lead, p['phl'], p['ths'], heel, side),
@@ -157,9 +177,11 @@ def step(
     heading = quintic(u, 0, -previous.turn / STEP, 0, this.turn, this.turn / STEP, 0, STEP)
     turn = quintic(u, ROTATION * start.size, 0, 0, -ROTATION * end.size, 0, 0, STEP)
     pelvis = (
-        figure3d.yaw(heading + turn) @ figure3d.pitch(0 * u + LEAN) @ figure3d.roll(-LIST * bump(u))
+        figure3d.yaw(heading + turn)
+        @ figure3d.pitch(0 * u + p['lean'])
+        @ figure3d.roll(-p['list'] * bump(u))
     )
-    torso = figure3d.yaw(heading - COUNTER * turn) @ figure3d.pitch(0 * u + TORSO_LEAN)
+    torso = figure3d.yaw(heading - COUNTER * turn) @ figure3d.pitch(0 * u + p['torso'])
 
     feet = {'right': _stance(p, start, end, u), 'left': _swing(p, start, end, trail, land, u)}
     yaws = {
@@ -229,8 +251,10 @@ def _swing(p, start: Node, end: Node, trail, land, u):
     to_heel = figure3d.smooth(tau)[:, None]
     shift = to_heel * figure3d.rolled(tilt, heel) + (1 - to_heel) * figure3d.rolled(tilt, toe)
     path = trail + _travel(p, u)[:, None] * (land - trail)
-    passing = trail[1] - trail[0] * (land[1] - trail[1]) / (land[0] - trail[0])
+    slope = (land[1] - trail[1]) / (land[0] - trail[0]) if land[0] > trail[0] else 0.0
+    passing = trail[1] - trail[0] * slope
     path[:, 1] += max(0.0, CLEARANCE - passing) * bump(tau)
+    path[:, 1] += p['aside'] * bump(tau)
     up = p['lift'] * (0.5 + 0.5 * min(size, 1)) * bump(tau) * (1 + p['lsk'] * (1 - 2 * tau))
     return np.column_stack([path, sole + up]), tilt, shift
 
@@ -258,25 +282,29 @@ def walk(name: str, character: str, this: Step, shape: str = '') -> motion.Clip:
     )
 
 
-def library(name: str, shape: str = '') -> motion.FootstepLibrary:
-    """Returns the step library of a character: straight, wide and turning, all after `USUAL`."""
-    made, p = figure3d.figure(name), SHAPES[shape or name]
+def library(name: str, shape: str = '', style: str = '') -> motion.FootstepLibrary:
+    """Returns the step library of a character, or of one of its styles.
+
+    The steps are straight, wide and turning, all after the first one of `IN_PLACE` or after `USUAL`.
+    """
+    made, p = figure3d.figure(name), SHAPES[shape or name] | STYLES.get(style, {})
+    steps, before = (IN_PLACE, IN_PLACE[0]) if style == 'in_place' else (LIBRARY, USUAL)
     u = np.linspace(0, 1, round(STEP_RATE * STEP) + 1)
     poses, labels, features = [], [], []
-    for this in LIBRARY:
-        bodies = step(made, p, USUAL, this, u)
+    for this in steps:
+        bodies = step(made, p, before, this, u)
         poses.append(made.poses(bodies))
         labels.append((this.length, this.width, this.turn))
         features.append(figure3d.features(made, bodies, this.turn))
-    usual = (USUAL.length, USUAL.width, USUAL.turn)
+    previous = (before.length, before.width, before.turn)
     return motion.FootstepLibrary(
-        name=name,
+        name=f'{name}_{style}' if style else name,
         times=STEP * u,
         poses=np.array(poses),
         joints=made.layout.joints,
         sizes=made.layout.sizes,
         labels=np.array(labels),
-        previous=np.tile(usual, (len(labels), 1)),
+        previous=np.tile(previous, (len(labels), 1)),
         features=np.array(features),
         description=f'{len(labels)} walking steps of {STEP:g} s',
     )
@@ -292,6 +320,11 @@ LIBRARY = (
         for turn in (-0.8, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.8)
     ),
 )
+IN_PLACE = (
+    *(Step(length, 0.15) for length in (0.0, 0.05, 0.1)),
+    *(Step(0.0, width) for width in (0.12, 0.22)),
+    *(Step(0.0, 0.15, turn) for turn in (-0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.8)),
+)
 
 
 def clips() -> list[motion.Clip]:
@@ -305,4 +338,8 @@ def clips() -> list[motion.Clip]:
 
 def libraries() -> list[motion.FootstepLibrary]:
     """Returns the step libraries of this recipe; both bodies have the same legs."""
-    return [library('biped3d_mocap'), library('biped3d_full_mocap', 'biped3d_mocap')]
+    return [
+        library('biped3d_mocap'),
+        library('biped3d_full_mocap', 'biped3d_mocap'),
+        *(library('biped3d_mocap', style=style) for style in STYLES),
+    ]

@@ -11,6 +11,7 @@ import numpy as np
 from trl_suite import terrain
 from trl_suite.describe import gait
 from trl_suite.describe.common import REWARD_WEIGHT, actions, floats, reward
+from trl_suite.describe.options import table_of
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
@@ -20,7 +21,7 @@ from trl_suite.tasks.rewards import fall_condition
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
-from trl_suite.util.tables import Section, section
+from trl_suite.util.tables import Section, Table, section
 
 _PLANS = 'Plans: drawn at every switch of stance'
 _SWING = (
@@ -123,6 +124,7 @@ def _planar_footsteps(spec: Any, task: Any) -> Iterator[Section]:
         _PLANS,
         f'steps {span(task.plans.length)} long, straight ahead; with probability {task.plans.change:g} '
         'the length is redrawn; right stance while the phase is below 0.5',
+        *_plan_options(task),
     )
     yield reward(task, _SWING)
     yield fall(task, missed(task))
@@ -130,15 +132,20 @@ def _planar_footsteps(spec: Any, task: Any) -> Iterator[Section]:
 
 def _spatial_footsteps(spec: Any, task: Any) -> Iterator[Section]:
     """Yields the sections on steps, plans, reward and termination."""
-    motion = task.motion
+    motion, factor = task.motion, task.config.pose_scale
     yield section(
         f'Steps: {motion.name}',
         f'{motion.description}, also mirrored; the reference is the step nearest to the plan. '
         f'Period (two steps) {task.period:.4g} s; right stance while the phase is below 0.5',
     )
-    yield section(_PLANS, '; '.join(_plans(task)))
-    yield reward(task, _SWING)
+    yield section(_PLANS, '; '.join(_plans(task)), *_plan_options(task))
+    notes = [_SWING] if factor == 1 else [_SWING, f'pose: the error is multiplied by {factor:g}']
+    yield reward(task, '; '.join(notes))
     yield fall(task, missed(task))
+
+
+def _plan_options(task: Any) -> tuple[str, Table]:
+    return 'Options of plans:', table_of(type(task.plans))
 
 
 def _plans(task: Any) -> list[str]:

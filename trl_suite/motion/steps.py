@@ -195,7 +195,7 @@ def features(
 
 
 def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
-    """Returns a shipped library by its character's name, or a saved one by its path.
+    """Returns a shipped library by its name, or a saved one by its path.
 
     Args:
       path_or_name: a name of `names()`, or a path: a string that ends in .npz, or a PathLike.
@@ -213,7 +213,7 @@ def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
 
 
 def names() -> list[str]:
-    """Returns the sorted names of the shipped libraries, which are names of characters."""
+    """Returns the sorted names of the shipped libraries: of a character, or of one and a style."""
     found = resources.directory('mocap').glob(f'*{STEPS_SUFFIX}.npz')
     return sorted(path.stem.removesuffix(STEPS_SUFFIX) for path in found)
 

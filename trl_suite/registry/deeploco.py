@@ -39,7 +39,7 @@ def _step(
     **given: Any,
 ) -> EnvSpec:
     return _spec(
-        ('spatial',),
+        ('spatial',) if 'mirrored' in given else ('spatial', 'controller'),
         id=id_,
         task=task,
         character=character,
@@ -98,6 +98,31 @@ _STEPS = (
         'PD_Biped3D_FULL_Imitate-Steps-v0', 'llc_full_step',
         'with arms and head walks along planned footsteps', character='biped3d_full_mocap',
         aliases=('PD_Biped3D_Full_LLC_Step-v0',),
+    ),
+)  # fmt: skip
+
+
+_STYLE = (
+    'the reference steps, made for this suite, have the style; the paper adds a term for it to the reward',
+)
+
+
+def _styled(name: str, style: str, words: str, **given: Any) -> EnvSpec:
+    return _step(
+        f'PD_Biped3D_LLC_{name}_Step-v0', f'llc_{style}_step',
+        f'walks along planned footsteps {words}', original=False, style=style, pose_scale=10.0,
+        differences=_STYLE, **given,
+    )  # fmt: skip
+
+
+# Ways of walking of the paper beside the nominal one.
+_STYLES = (
+    _styled('HighKnees', 'high_knees', 'with high knees'),
+    _styled('StraightLegs', 'straight_legs', 'with straight legs'),
+    _styled('ForwardLean', 'forward_lean', 'and leans forward'),
+    _styled(
+        'InPlace', 'in_place', 'in place',
+        plans={'length': (0.0, 0.1), 'turn': 0.2, 'change': 1.0},
     ),
 )  # fmt: skip
 
@@ -191,4 +216,4 @@ _JOURNEYS = (
     ),
 )  # fmt: skip
 
-SPECS = (*_STEPS, _STEP2D, *_HIKES, *_JOURNEYS)
+SPECS = (*_STEPS, *_STYLES, _STEP2D, *_HIKES, *_JOURNEYS)

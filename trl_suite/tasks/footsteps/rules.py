@@ -67,7 +67,7 @@ class FootstepData(NamedTuple):
     Attributes:
       tracking: data of every tracking task; the period is that of two steps.
       turns: whether the character turns; a planar one can only point backwards.
-      footstep_scales, heading_scale: factors of errors in the reward.
+      pose_scale, footstep_scales, heading_scale: factors of errors in the reward.
       largest_miss: landing error above which the episode fails, m.
     """
 
@@ -75,6 +75,7 @@ class FootstepData(NamedTuple):
     plan: FootstepPlan
     state: FootstepState
     turns: bool
+    pose_scale: float
     footstep_scales: np.ndarray
     heading_scale: float
     largest_miss: float
@@ -142,7 +143,7 @@ def compare(i: int, data: FootstepData) -> None:
                 off += feature(row, fraction, column, tracks)
             step += off * off
     terms, outcome = comparison.terms, data.tracking.outcome
-    score(i, pose, terms.pose, outcome)
+    score(i, data.pose_scale * pose, terms.pose, outcome)
     score(i, velocity, terms.velocity, outcome)
     score(i, com, terms.com, outcome)
     score(i, height, terms.root, outcome)

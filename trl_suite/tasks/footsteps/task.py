@@ -20,7 +20,7 @@ from trl_suite.bodies.reference import CONTROL_TIMESTEP, Reference
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
-from trl_suite.motion import quaternion, step_features
+from trl_suite.motion import load_steps, quaternion, step_features
 from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
@@ -30,6 +30,7 @@ from trl_suite.tasks.common.footstep_plan import (
     FootstepPlan,
     check_two_feet,
     plan_markers,
+    straight_step,
 )
 from trl_suite.tasks.common.goals import GOAL, GOAL_COLOUR, flag
 from trl_suite.tasks.footsteps.planner import (
@@ -88,8 +89,14 @@ class SpatialFootstepsConfig(MirroredConfig):
     footstep_scale: float | Sequence[float] = option(
         1.0, f'{FOOTSTEP_SCALE}; with several values, the term is the mean over them', at_least=0
     )
+    pose_scale: float = option(1.0, 'factor of the error of the pose in the reward', at_least=0)
     heading_scale: float = option(
         1.0, 'factor of the error of the heading in the reward', at_least=0
+    )
+    style: str | None = option(
+        None,
+        "way of walking, such as 'high_knees': the reference is the step library mocap/NAME_STYLE_steps.npz, "
+        'NAME that of the library without style, whose mean pose remains action 0',
     )
     hidden_plan: bool = option(
         False,
@@ -131,6 +138,7 @@ class Footsteps(PlanTask):
             plan=self.plan,
             state=self.state,
             turns=self._spatial,
+            pose_scale=float(getattr(config, 'pose_scale', 1.0)),
             footstep_scales=np.atleast_1d(config.footstep_scale).astype(float),
             heading_scale=float(getattr(config, 'heading_scale', 1.0)),
             largest_miss=np.inf if limit is None else float(limit),
@@ -195,6 +203,9 @@ class SpatialFootsteps(Footsteps):
     def __init__(self, character: Character, *args: Any, **kwargs: Any) -> None:
         """Composes the task; the arguments are those of `TrackingTask`."""
         super().__init__(character, *args, **kwargs)
+        if self.config.style is not None:
+            self.motion = self.steps = load_steps(f'{self.steps.name}_{self.config.style}')
+            self._first = straight_step(self.steps, self.length)
         pushes = self.config.pushes
         if pushes is not None:
             body = pushes.body or character.spec.links[1]  # the torso
