@@ -46,6 +46,22 @@ CONDITIONS = (
     'straight', 'general', 'bumps of 6 cm', 'belts of 0.6 m/s', 'pushes of 150 N', 'pushes of 250 N',
 )  # fmt: skip
 
+# DeepLoco (2017), supplement, table 3: normalised reward of a planner with the controller of a style,
+# unchanged, fine-tuned and retrained.
+STYLES = {
+    'nominal': ('General', {}),
+    'in place': ('InPlace', {}),
+    'high knees': ('HighKnees', {
+        'soccer': '.19 .56 .51', 'path': '.10 .39 –', 'pillars': '.06 .43 –'}),
+    'one straight leg': ('', {
+        'soccer': '.51 .64 .45', 'path': '.08 .19 –', 'pillars': '.15 .35 –'}),
+    'both legs straight': ('StraightLegs', {'soccer': '.16 .63 –'}),
+    'forward lean': ('ForwardLean', {
+        'soccer': '.64 .69 –', 'path': '.43 .44 –', 'pillars': '.43 .45 –'}),
+    'sideways lean': ('', {'soccer': '.41 .72 .74'}),
+}  # fmt: skip
+TASKS = {'soccer': 'Soccer', 'path': 'PathFollowing', 'pillars': 'Forest'}
+
 
 @functools.cache
 def stored(name: str) -> dict[str, Any]:
@@ -60,7 +76,12 @@ def tables() -> dict[str, dict[str, str]]:
         'action_spaces.md': {'returns': action_spaces()},
         'plaid.md': {'final rewards': plaid(0), 'changes': plaid(1)},
         'terrain_adaptive_gaits.md': {'distances': gaits()},
-        'deeploco.md': {'footsteps': footsteps(), 'plans': plans()},
+        'deeploco.md': {
+            'footsteps': footsteps(),
+            'plans': plans(),
+            'styles': styles(),
+            'transfer': transfer(),
+        },
     }
 
 
@@ -138,7 +159,7 @@ def gaits() -> str:
 
 
 def footsteps() -> str:
-    found = stored('footsteps')['conditions']
+    found = stored('footsteps')['PD_Biped3D_LLC_General_Step-v0']
     return table(
         ('footstep controller', 'no fall', 'landing error, m'),
         ((name, f'{found[name]["survived"]:.0%}', f'{found[name]["landing"]:.3f}') for name in CONDITIONS),
@@ -152,3 +173,40 @@ def plans() -> str:
         for id, found in stored('plans').items() if 'scripted' in found
     ]  # fmt: skip
     return table(('planner', 'score, hand-written', 'score, trained', 'no fall in 200 s'), rows)
+
+
+def styles() -> str:
+    rows = []
+    for name, (part, _) in STYLES.items():
+        found = stored('footsteps').get(f'PD_Biped3D_LLC_{part}_Step-v0')
+        if found is None:
+            continue
+        general, pushed = found['general'], found['pushes of 150 N']
+        rows.append((
+            name, *(f'{general[key]:.2f}' for key in ('hip_above_knee', 'knee', 'lean')),
+            f'{general["survived"]:.0%}', f'{general["landing"]:.3f}', f'{pushed["survived"]:.0%}',
+        ))  # fmt: skip
+    columns = (
+        'hip above knee, m',
+        'knee, rad',
+        'lean, rad',
+        'no fall',
+        'landing error, m',
+        'no fall, 150 N',
+    )
+    return table(('style', *columns), rows)
+
+
+def transfer() -> str:
+    rows = []
+    for task, part in TASKS.items():
+        found = stored('plans')[f'PD_Biped3D_HLC_{part}-v0']
+        for name, (controller, published) in STYLES.items():
+            nominal = name == 'nominal'
+            under = '' if nominal else f' with PD_Biped3D_LLC_{controller}_Step-v0'
+            ours = [found.get(kind + under) for kind in ('reference', 'fine-tuned')]
+            if task in published or ours[0] is not None:
+                figures = ('–' if each is None else f'{each["reward"]:.2f}' for each in ours)
+                rows.append((f'{task}, {name}', *published.get(task, '– – –').split(), *figures))
+    columns = 'unchanged', 'fine-tuned', 'retrained', 'ours, unchanged', 'ours, fine-tuned'
+    return table(('task, controller', *columns), rows)

@@ -1,27 +1,28 @@
 """Evaluates footstep tracking of a footstep controller: plans, pushes, slopes, bumps, belts.
 
     python training/evaluate_footsteps.py                           # the reference policy
-    python training/evaluate_footsteps.py mine.npz --filter general straight --json mine.json
+    python training/evaluate_footsteps.py --id PD_Biped3D_LLC_HighKnees_Step-v0
+    python training/evaluate_footsteps.py mine.npz --filter general straight
 
 Prints for every condition, over episodes with the seeds of `evaluation.evaluate`: the share of
 episodes that last to the end, the mean reward per step (0 after a fall), the distance from planned
 to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
-heading error at landing.
+heading error at landing; and of the posture, the least height of the hip above the knee and the largest
+flexion of the knee in a swing, and the forward lean of the trunk (means). Those of reference policies
+are written to trained/footsteps.json.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import pathlib
 from typing import Any
 
 import numpy as np
+import runs
 
 from trl_suite import policies, suite
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.util import files
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -74,10 +75,31 @@ def row_for(id_: str, terrain: Any) -> EnvSpec:
     return dataclasses.replace(spec, terrain=terrain or spec.terrain, options=options)
 
 
+def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the height of each hip above its knee, (n, 2) m, the knees' flexion, (n, 2) rad, and the lean.
+
+    Right before left; the lean, (n,) rad, is that of the trunk forwards.
+    """
+    places, body = task.world.xpos, task.world.models[0].body
+    name = task.character.spec.name
+    hip, knee, ankle = (
+        places[:, [body(f'{name}/{side}_{joint}').id for side in ('right', 'left')]]
+        for joint in ('hip', 'knee', 'ankle')
+    )
+    thigh, shank = knee - hip, ankle - knee
+    lengths = np.linalg.norm(thigh, axis=2) * np.linalg.norm(shank, axis=2)
+    flexion = np.arccos(np.clip((thigh * shank).sum(2) / lengths, -1, 1))
+    w, x, y, z = task.world.xquat[:, body(f'{name}/torso').id].T
+    up = 2 * np.stack([x * z + w * y, y * z - w * x], 1)
+    heading = task.body.measurement.heading
+    forward = up[:, 0] * np.cos(heading) + up[:, 1] * np.sin(heading)
+    return hip[:, :, 2] - knee[:, :, 2], flexion, np.arcsin(np.clip(forward, -1, 1))
+
+
 def run(
     spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
 ) -> dict[str, Any]:
-    """Runs one episode in every simulation; returns survival, reward and tracking errors."""
+    """Runs one episode in every simulation; returns survival, reward, errors and posture."""
     steps = round(seconds * 30)
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     environments = VectorEnvironment(
@@ -87,11 +109,20 @@ def run(
     observation = environments.reset()
     runs, reward = np.ones(episodes, bool), 0.0
     full, distance = np.zeros(episodes, bool), np.zeros(episodes)
-    landing, heading = [], []
+    landing, heading, lean = [], [], []
+    swings, swing = [], np.tile([[np.inf], [0.0]], episodes)  # extremes of the present step
     while runs.any():
+        side = 1 - environments.task.stance
         step = environments.step(policy(observation))
         reward += float(step.reward[runs].sum())
         landed = step.info['landed'] & runs
+        heights, flexion, leans = postures(environments.task)
+        rows = np.arange(episodes)
+        swing[0] = np.minimum(swing[0], heights[rows, side])
+        swing[1] = np.maximum(swing[1], flexion[rows, side])
+        swings.append(swing[:, landed])
+        lean.append(leans[runs])
+        swing[:, step.info['landed']] = [[np.inf], [0.0]]
         landing.append(step.info['landing_error'][landed])
         heading.append(step.info['heading_error'][landed])
         ended = step.terminated | step.truncated
@@ -103,11 +134,13 @@ def run(
             observation = environments.reset(ended)
     environments.close()
     errors, turns = np.concatenate(landing), np.concatenate(heading)
+    least, most = np.concatenate(swings, axis=1).mean(1)
     return {
         'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
         'normalized_return': reward / (steps * episodes), 'landing': float(errors.mean()),
         'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
-        'distance': float(distance.mean()),
+        'distance': float(distance.mean()), 'hip_above_knee': float(least), 'knee': float(most),
+        'lean': float(np.concatenate(lean).mean()),
     }  # fmt: skip
 
 
@@ -122,7 +155,6 @@ def main() -> None:
     parser.add_argument('--episodes', type=int, default=100)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=SECONDS)
-    parser.add_argument('--json', type=pathlib.Path)
     arguments = parser.parse_args()
     if arguments.policy and arguments.variant:
         parser.error('give either a file or --variant, not both')
@@ -131,22 +163,23 @@ def main() -> None:
         if arguments.policy
         else suite.reference_policy(arguments.id, arguments.variant)
     )
-    found = {}
+    written = runs.read('footsteps.json')
     for name in arguments.filter:
         options = dict(CONDITIONS[name])
         row = row_for(arguments.id, options.pop('terrain', None))
-        found[name] = result = run(
-            row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
-        )
+        own = suite.find(arguments.id).options.get('plans', {})
+        options['plans'] = {**own, **options['plans']}
+        result = run(row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options)
         print(
             f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
-            f'heading {result["heading"]:.3f} rad',
+            f'heading {result["heading"]:.3f} rad  hip above knee {result["hip_above_knee"]:.2f} m  '
+            f'knee {result["knee"]:.2f}, lean {result["lean"]:.2f} rad',
             flush=True,
         )
-    if arguments.json:
-        with files.replacing(arguments.json) as part:
-            part.write_text(json.dumps({'id': arguments.id, 'conditions': found}, indent=1) + '\n')
+        if not arguments.policy and not arguments.variant:
+            written.setdefault(arguments.id, {})[name] = result
+            runs.write('footsteps.json', written)
 
 
 if __name__ == '__main__':

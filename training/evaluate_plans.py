@@ -2,6 +2,8 @@
 
     python training/evaluate_plans.py                                      # all, both policies
     python training/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 32
+    python training/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies reference \
+        --controller PD_Biped3D_LLC_HighKnees_Step-v0
 
 Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds
 of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
@@ -50,13 +52,15 @@ def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarr
     return found
 
 
-def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int) -> dict:
+def run(
+    id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int, **options: Any
+) -> dict:
     """Runs one episode in every simulation; returns the measured quantities."""
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     own = 'hierarchical' in catalogue.BY_ID[id_].tags
     limit = -1 if own else round(SECONDS / CONTROL_TIMESTEP)
     environments = VectorEnvironment(
-        id_, episodes, 0, seeds, step_limit=limit, autoreset='disabled'
+        id_, episodes, 0, seeds, step_limit=limit, autoreset='disabled', task_kwargs=options
     )
     policy, observation = make(environments), environments.reset()
     task, limit = environments.task, environments.step_limit
@@ -128,6 +132,7 @@ def main() -> None:
     parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
     parser.add_argument('--episodes', type=int, default=EPISODES)
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--controller', help='footstep controller, instead of the default')
     arguments = parser.parse_args()
     ids = [
         spec.id
@@ -136,15 +141,17 @@ def main() -> None:
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
+    options = {} if arguments.controller is None else {'controller': arguments.controller}
+    under = '' if arguments.controller is None else f' with {arguments.controller}'
     found = runs.read('plans.json')
     for id_ in ids:
         for name in arguments.policies:
             make = maker(id_, name)
             if make is None:
                 continue
-            result = run(id_, make, arguments.episodes, arguments.seed)
-            found.setdefault(id_, {})[name] = result
-            print(id_, name, {k: round(v, 3) for k, v in result.items()}, flush=True)
+            result = run(id_, make, arguments.episodes, arguments.seed, **options)
+            found.setdefault(id_, {})[name + under] = result
+            print(id_, name + under, {k: round(v, 3) for k, v in result.items()}, flush=True)
             runs.write('plans.json', found)
 
 

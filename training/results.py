@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import evaluate_footsteps
 import numpy as np
 import oracles
 import runs
@@ -152,7 +153,7 @@ def generalist_rows() -> Rows:
 
 
 def footstep_rows() -> Rows:
-    for name, found in runs.read('footsteps.json').get('conditions', {}).items():
+    for name, found in runs.read('footsteps.json').get(evaluate_footsteps.ID, {}).items():
         errors = (f'{found[key]:.3f}' for key in ('landing', 'landing_90', 'heading'))
         score = f'{found["normalized_return"]:.3f}'
         yield [name, str(found['episodes']), f'{found["survived"]:.0%}', score, *errors]

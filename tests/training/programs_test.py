@@ -24,6 +24,7 @@ import settings
 import share_gaits
 import train_all
 import train_randomized
+import transfer_planners
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 from programs import output
@@ -398,6 +399,19 @@ class FootstepsTest(parameterized.TestCase):
         )  # fmt: skip
         self.assertEqual(found['survived'], 1.0)
         self.assertLess(found['landing'], error)
+
+
+class PlannerTransferTest(absltest.TestCase):
+    def test_starts_from_the_shipped_planner_with_the_controller(self):
+        id_, controller = 'PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_HighKnees_Step-v0'
+        given = transfer_planners.fine_tuned(id_, controller, 1e5)
+        trainer = ppo.Trainer(id_, 0, dataclasses.replace(given, num_envs=2), 1)
+        walker = trainer.environments.task.controller.policy
+        self.assertEqual(walker.id, policies.reference(controller).id)
+        seen, left = trainer.seen(trainer.observation)
+        actions = np.clip(trainer.unmirrored(trainer.means(seen), left), -1, 1)
+        expected = policies.reference(id_)(trainer.observation)
+        np.testing.assert_allclose(actions, expected, atol=2e-3)  # the scales are rounded
 
 
 class PageTest(FolderTest):
