@@ -722,7 +722,10 @@ REFUSED = (
     (GENERAL, {'pushes': {'power': 1}}, "unknown option of pushes 'power'"),
     (GENERAL, {'pushes': {'force': (3, 2)}}, 'force is'), (GENERAL, {'grace_period': -1}, 'grace_period is -1'),
     (GENERAL, {'footstep_scale': ()}, 'footstep_scale is '), (GENERAL, {'heading_scale': -1}, 'heading_scale is -1'),
-    (GENERAL, {'style': 'high_knee'}, "'biped3d_mocap_high_knee'; did you mean 'biped3d_mocap_high_knees'"),
+    (GENERAL, {'style': 'high_knee'}, "unknown style of 'biped3d_mocap' 'high_knee'; did you mean 'high_knees'"),
+    (GENERAL, {'style': 'run'}, "unknown style of 'biped3d_mocap' 'run'"),  # of another character
+    (GENERAL, {'style': 'mine.npz'}, "unknown style of 'biped3d_mocap' '.*mine.npz'"),
+    (FULL, {'style': 'in_place'}, "unknown style of 'biped3d_full_mocap' 'in_place'"),
     (GENERAL, {'footstep_scale': (1, np.inf)}, r'footstep_scale is \(1, inf'),
 )  # fmt: skip
 

@@ -53,7 +53,7 @@ def naming(
 
 def _listed(names: list[str]) -> str:
     if len(names) <= MANY:
-        return ', '.join(names)
+        return ', '.join(names) or 'none'
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
 
 

@@ -18,9 +18,9 @@ from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import Measurement
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Reference
 from trl_suite.bodies.state import allocated
-from trl_suite.characters import Character, CharacterSpec
+from trl_suite.characters import CHARACTERS, Character, CharacterSpec
 from trl_suite.engine import World
-from trl_suite.motion import load_steps, quaternion, step_features
+from trl_suite.motion import FootstepLibrary, load_steps, quaternion, step_features, steps_names
 from trl_suite.tasks.common.control import MirroredConfig, PlanarConfig
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
@@ -52,6 +52,7 @@ from trl_suite.tasks.footsteps.rules import (
 )
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.variation.pushes import PushConfig, Pushes
+from trl_suite.util.errors import check_known
 from trl_suite.util.options import Range, option
 
 PUSHES = {'force': (50.0, 150.0), 'duration': (0.2, 0.4), 'interval': (1.0, 2.0)}  # defaults
@@ -204,7 +205,7 @@ class SpatialFootsteps(Footsteps):
         """Composes the task; the arguments are those of `TrackingTask`."""
         super().__init__(character, *args, **kwargs)
         if self.config.style is not None:
-            self.motion = self.steps = load_steps(f'{self.steps.name}_{self.config.style}')
+            self.motion = self.steps = styled(self.steps, self.config.style)
             self._first = straight_step(self.steps, self.length)
         pushes = self.config.pushes
         if pushes is not None:
@@ -333,6 +334,19 @@ class PlanarFootsteps(Footsteps):
         pose = self.clip.pose(time)
         pose[0] += self.state.shift[env_id, 0]
         return self._on_ground(env_id, pose)
+
+
+def styled(steps: FootstepLibrary, style: str) -> FootstepLibrary:
+    """Returns the shipped library of steps in a style.
+
+    Raises:
+      ValueError: there is none for these steps; the message has the closest.
+    """
+    prefix = f'{steps.name}_'
+    named = {name for name in steps_names() if name.startswith(prefix)}
+    known = {name.removeprefix(prefix) for name in named - {*CHARACTERS}}
+    check_known(f'style of {steps.name!r}', known, style)
+    return load_steps(prefix + style)
 
 
 def check_feet(character: CharacterSpec) -> None:
