@@ -80,20 +80,20 @@ def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Right before left; the lean, (n,) rad, is that of the trunk forwards.
     """
-    places, body = task.world.xpos, task.world.models[0].body
-    name = task.character.spec.name
+    names = [*task.character.spec.links]
+    places = task.world.xpos[:, task.body.links]
     hip, knee, ankle = (
-        places[:, [body(f'{name}/{side}_{joint}').id for side in ('right', 'left')]]
+        places[:, [names.index(f'{side}_{joint}') for side in ('right', 'left')]]
         for joint in ('hip', 'knee', 'ankle')
     )
     thigh, shank = knee - hip, ankle - knee
     lengths = np.linalg.norm(thigh, axis=2) * np.linalg.norm(shank, axis=2)
     flexion = np.arccos(np.clip((thigh * shank).sum(2) / lengths, -1, 1))
-    w, x, y, z = task.world.xquat[:, body(f'{name}/torso').id].T
-    up = 2 * np.stack([x * z + w * y, y * z - w * x], 1)
-    heading = task.body.measurement.heading
-    forward = up[:, 0] * np.cos(heading) + up[:, 1] * np.sin(heading)
-    return hip[:, :, 2] - knee[:, :, 2], flexion, np.arcsin(np.clip(forward, -1, 1))
+    # The pose has the height of the root, then position and orientation of links in the heading frame.
+    links = task.body.measurement.pose[:, 1:].reshape(len(places), len(names), 7)
+    w, x, y, z = links[:, names.index('torso'), 3:].T
+    lean = np.arcsin(np.clip(2 * (x * z + w * y), -1, 1))
+    return hip[:, :, 2] - knee[:, :, 2], flexion, lean
 
 
 def run(
