@@ -38,14 +38,14 @@ SPATIAL = {
 }  # fmt: skip
 LIBRARIES = {'biped3d_mocap': 27, 'biped3d_full_mocap': 27, 'biped3d_mocap_run': 1}
 WALKS = ('biped3d_mocap', 'biped3d_full_mocap')
-# Height of the hip above the knee in swing, its least value, m; largest flexion of the knee in swing,
-# rad; mean forward lean of the trunk, rad; longest step, m.
+# How a style differs from the nominal steps: least height of the hip above the knee in swing, m; largest
+# flexion of the knee in swing, rad; mean forward lean of the trunk, rad; longest step, m.
 STYLES = {
-    '': (0.35, 1.16, 0.02, 0.7),
-    '_high_knees': (0.27, 1.73, 0.02, 0.7),
-    '_straight_legs': (0.38, 0.52, 0.02, 0.7),
-    '_forward_lean': (0.335, 1.2, 0.45, 0.7),
-    '_in_place': (0.375, 0.93, 0.02, 0.1),
+    '_high_knees': lambda hip, knee, lean, length: hip < -0.05 and knee > 0.4,
+    '_straight_legs': lambda hip, knee, lean, length: hip > 0.02 and knee < -0.5,
+    '_forward_lean': lambda hip, knee, lean, length: lean > 0.3,
+    '_in_place': lambda hip, knee, lean, length: length <= -0.6,
+    '_stand': lambda hip, knee, lean, length: hip == knee == lean == length == 0,  # in its steps
 }
 DEEPEST = 0.01  # m below the ground
 SLIDE = 0.02  # m a planted foot may travel
@@ -141,6 +141,21 @@ def ankles(model, clip, t):
     return np.array([foot.xpos[:2] for foot in feet]), np.array(yaw)
 
 
+def posture(library):
+    """Returns what `STYLES` compares, of the step that is repeated to walk, (4,)."""
+    model = figure3d.model('biped3d_mocap')
+    usual = int(np.argmin(np.abs(library.labels - library.previous).sum(axis=1)))
+    clip, data, found = library.clip(usual), mujoco.MjData(model), []
+    for t in np.linspace(0, clip.duration, 41):
+        data.qpos[checks3d.place(model, clip)] = clip.pose(t)
+        mujoco.mj_kinematics(model, data)
+        hip, knee = (data.body(f'left_{name}').xpos[2] for name in ('hip', 'knee'))
+        lean = np.arcsin(data.body('torso').xmat[2])
+        found.append((hip - knee, -float(data.joint('left_knee').qpos[0]), lean))
+    hip, knee, lean = np.transpose(found)
+    return np.array([hip.min(), knee.max(), lean.mean(), library.labels[:, 0].max()])
+
+
 class LibraryTest(parameterized.TestCase):
     @parameterized.parameters(*LIBRARIES)
     def test_steps_are_as_good_as_the_clips(self, name):
@@ -158,26 +173,17 @@ class LibraryTest(parameterized.TestCase):
             self.assertLess(report.overlap, checks3d.DEEP, i)
             self.assertEqual(report.planted > 0.95, name in WALKS, i)
 
-    @parameterized.parameters(*STYLES.items())
-    def test_styles(self, style, expected):
-        library, model = motion.load_steps(f'biped3d_mocap{style}'), figure3d.model('biped3d_mocap')
+    @parameterized.parameters(*STYLES)
+    def test_styles(self, style):
+        library = motion.load_steps(f'biped3d_mocap{style}')
         for i in range(len(library)):
             report = checks3d.measure(library.clip(i), 'biped3d_mocap', 121)
             self.assertGreater(report.lowest, -DEEPEST, i)
             self.assertLess(report.slide, SLIDE, i)
             self.assertGreaterEqual(report.margin[0], 0.01, report.margin[1])
             self.assertLess(report.overlap, checks3d.DEEP, i)
-        usual = int(np.argmin(np.abs(library.labels - library.previous).sum(axis=1)))
-        clip, data, found = library.clip(usual), mujoco.MjData(model), []
-        for t in np.linspace(0, clip.duration, 41):
-            data.qpos[checks3d.place(model, clip)] = clip.pose(t)
-            mujoco.mj_kinematics(model, data)
-            hip, knee = (data.body(f'left_{name}').xpos[2] for name in ('hip', 'knee'))
-            lean = np.arcsin(data.body('torso').xmat[2])
-            found.append((hip - knee, -float(data.joint('left_knee').qpos[0]), lean))
-        least, most, mean = (reduce(found, 0) for reduce in (np.min, np.max, np.mean))
-        measured = least[0], most[1], mean[2], library.labels[:, 0].max()
-        np.testing.assert_allclose(measured, expected, atol=0.02)
+        difference = posture(library) - posture(motion.load_steps('biped3d_mocap'))
+        self.assertTrue(STYLES[style](*difference), difference)
 
     @parameterized.product(name=tuple(LIBRARIES), mirrored=(False, True))
     def test_lands_as_labelled(self, name, mirrored):
@@ -205,9 +211,27 @@ class LibraryTest(parameterized.TestCase):
         end = first.poses[-1] - np.pad([*library.labels[usual, :2]], (0, first.poses.shape[1] - 2))
         np.testing.assert_allclose(end, second.poses[0], atol=1e-9)
 
-    @parameterized.product(heading=(0.0, 2.8), mirrored=(False, True))
-    def test_a_walker_as_a_clip_starts_with_its_landing_as_plan_gets_it(self, heading, mirrored):
-        library, model = motion.load_steps('biped3d_mocap'), figure3d.model('biped3d_mocap')
+    def test_steps_end_and_begin_in_a_stand(self):
+        library = motion.load_steps('biped3d_mocap_stand')
+        standing, usual = (
+            (library.previous == label).all(1) for label in ((0, 0.15, 0), (0.5, 0.15, 0))
+        )
+        self.assertEqual((standing.sum(), usual.sum()), (14, 28))
+        [stand] = np.flatnonzero(standing & (library.labels == (0, 0.15, 0)).all(1))
+        [stop] = np.flatnonzero(usual & (library.labels == (0, 0.15, 0)).all(1))
+        still = library.poses[stand, 0]
+        np.testing.assert_array_equal(library.poses[stand], np.tile(still, (31, 1)))
+        np.testing.assert_array_equal(library.poses[standing, 0], np.tile(still, (14, 1)))
+        end = library.pose(stop, library.duration, True)  # in left stance, the right foot lands
+        np.testing.assert_allclose(end[2:], still[2:], atol=1e-9)
+        rate = np.abs(library.velocity(stop, library.duration)).max()
+        self.assertLess(rate, 0.2)  # of a mean over the last 1/60 s
+
+    @parameterized.product(style=('', '_stand'), heading=(0.0, 2.8), mirrored=(False, True))
+    def test_a_walker_as_a_clip_starts_with_its_landing_as_plan_gets_it(
+        self, style, heading, mirrored
+    ):
+        library, model = motion.load_steps(f'biped3d_mocap{style}'), figure3d.model('biped3d_mocap')
         shift, numbers = (3.0, -7.0), np.arange(len(library))
         clips = [library.clip(i, mirrored) for i in numbers]
         feet = np.array([ankles(model, clip, 0)[0] for clip in clips])

@@ -377,9 +377,10 @@ class StepsTest(FolderTest):
         library = steps()
         query = np.zeros((3, 7))
         query[1:] = library.features[1]
-        query[2, :4] = -100  # the feet at the start have no weight by default
-        np.testing.assert_array_equal(library.select(query), (0, 1, 1))
-        np.testing.assert_array_equal(library.select(query, np.ones(7)), (0, 1, 0))
+        query[2, :4] = -100  # nearer to the feet at the start of the other clip
+        for weights, expected in (((0,) * 4 + (1,) * 3, 1), (np.ones(7), 0)):
+            np.testing.assert_array_equal(library.select(query, weights), (0, 1, expected))
+        np.testing.assert_array_equal(library.select(query), (0, 1, 0))
 
     def test_round_trip(self):
         path, library = self.folder / 'steps_steps.npz', steps()

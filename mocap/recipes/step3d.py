@@ -11,7 +11,7 @@ steps are mirrored right ones.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import figure3d
 import numpy as np
@@ -33,11 +33,12 @@ STEP_RATE = 60  # frames per second of a library
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A step: forward m, outwards m, change of heading rad."""
+    """A step: forward m, outwards m, change of heading rad; whether the walker stands after it."""
 
     length: float
     width: float
     turn: float = 0.0
+    stand: bool = False
 
 
 # Shape parameters of a step from a least-squares fit (mocap/README.md describes the criteria).
@@ -85,6 +86,7 @@ STYLES: Mapping[str, Mapping[str, float]] = {
     },
     'forward_lean': {'lean': -0.20, 'torso': -0.45, 'xoff': -0.03},
     'in_place': {'xoff': 0.0},
+    'stand': {},
 }
 
 
@@ -117,15 +119,20 @@ def node(
     lead: np.ndarray,
     heading: float,
     side: int,
+    stand: bool,
 ) -> Node:
-    """Returns the node with `lead` (2,) in front; side 1 if that is the left foot, else -1."""
+    """Returns the node with `lead` (2,) in front; side 1 if that is the left foot, else -1.
+
+    To stand, all rates are 0 and the feet flat.
+    """
     toe, heel, sole = figure3d.FOOT
     e = np.array([np.cos(heading), np.sin(heading)])
     n = side * np.array([-e[1], e[0]])
     forward, outward = (lead - trail) @ e, (lead - trail) @ n
-    size = float(np.clip(forward / REFERENCE, 0.15, 1.3))
+    size = 0.0 if stand else float(np.clip(forward / REFERENCE, 0.15, 1.3))
     xy = (trail + lead) / 2 + p['xoff'] * e
     velocity = p['kap'] * forward / STEP * e + p['c'] * np.clip(outward, 0, 0.3) * n
+    velocity = velocity * (not stand)
     # The lead hip is turned forward; the root is as high as the shorter leg lets it.
     leg = sum(made.leg)
     turn = figure3d.yaw(np.array(heading - side * ROTATION * size)) @ figure3d.pitch(
@@ -143,7 +150,7 @@ def node(
         heights.append(float(sole + shift[1] + upright - hip[2]))
     z = min(heights)
     swing = max(sole + leg * np.cos(p['phm'] / 2) - z, 0.004) / 2 * (2 * np.pi / STEP) ** 2
-    return Node(xy, velocity, size, z, p['vzn'] * size, p['azs'] * swing)
+    return Node(xy, velocity, size, z, p['vzn'] * size, p['azs'] * swing * (not stand))
 
 
 def step(
@@ -153,13 +160,14 @@ def step(
 
     The stance foot is at the origin; the heading is along x at the start.
     """
+    u = u * (not (previous.stand and this.stand))
     right = np.zeros(2)
     cos, sin = np.cos(previous.turn), np.sin(previous.turn)
     back = np.array([previous.length, -previous.width])
     trail = -np.array([cos * back[0] - sin * back[1], sin * back[0] + cos * back[1]])
     land = np.array([this.length, this.width])
-    start = node(made, p, trail, right, 0.0, -1)
-    end = node(made, p, right, land, this.turn, 1)
+    start = node(made, p, trail, right, 0.0, -1, previous.stand)
+    end = node(made, p, right, land, this.turn, 1, this.stand)
     size = (start.size + end.size) / 2
 
     # Pelvis and torso.
@@ -285,18 +293,17 @@ def walk(name: str, character: str, this: Step, shape: str = '') -> motion.Clip:
 def library(name: str, shape: str = '', style: str = '') -> motion.FootstepLibrary:
     """Returns the step library of a character, or of one of its styles.
 
-    The steps are straight, wide and turning, all after the first one of `IN_PLACE` or after `USUAL`.
+    The steps are straight, wide and turning, all after `USUAL`, except those of `OWN`.
     """
     made, p = figure3d.figure(name), SHAPES[shape or name] | STYLES.get(style, {})
-    steps, before = (IN_PLACE, IN_PLACE[0]) if style == 'in_place' else (LIBRARY, USUAL)
+    pairs = OWN.get(style, [(USUAL, this) for this in LIBRARY])
     u = np.linspace(0, 1, round(STEP_RATE * STEP) + 1)
     poses, labels, features = [], [], []
-    for this in steps:
+    for before, this in pairs:
         bodies = step(made, p, before, this, u)
         poses.append(made.poses(bodies))
         labels.append((this.length, this.width, this.turn))
         features.append(figure3d.features(made, bodies, this.turn))
-    previous = (before.length, before.width, before.turn)
     return motion.FootstepLibrary(
         name=f'{name}_{style}' if style else name,
         times=STEP * u,
@@ -304,7 +311,7 @@ def library(name: str, shape: str = '', style: str = '') -> motion.FootstepLibra
         joints=made.layout.joints,
         sizes=made.layout.sizes,
         labels=np.array(labels),
-        previous=np.tile(previous, (len(labels), 1)),
+        previous=np.array([(before.length, before.width, before.turn) for before, _ in pairs]),
         features=np.array(features),
         description=f'{len(labels)} walking steps of {STEP:g} s',
     )
@@ -325,6 +332,17 @@ IN_PLACE = (
     *(Step(0.0, width) for width in (0.12, 0.22)),
     *(Step(0.0, 0.15, turn) for turn in (-0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.8)),
 )
+STAND = Step(0.0, 0.15, stand=True)
+# The steps of some styles, each after another one. To stand, the swing foot closes up and stays there.
+OWN: Mapping[str, Sequence[tuple[Step, Step]]] = {
+    'in_place': [(IN_PLACE[0], this) for this in IN_PLACE],
+    'stand': [
+        *((USUAL, this) for this in (*LIBRARY, STAND)),
+        *((STAND, this) for this in (*LIBRARY[:5], STAND)),
+        *((STAND, Step(0.0, 0.15, turn)) for turn in (-0.6, -0.4, 0.4, 0.8)),
+        *((STAND, Step(0.3, 0.15, turn)) for turn in (-0.8, -0.4, 0.4, 0.8)),
+    ],
+}
 
 
 def clips() -> list[motion.Clip]:

@@ -7,8 +7,8 @@ start; the heading of the pelvis oscillates slightly about it.
 
 As in the original (anim/MocapStepController.cpp), clips are selected by seven features, `FEATURES`,
 of the current state and the plan, relative to the current heading of the root. The original's
-weights scale with the spread of each feature over the library; here they are fixed. The weights of
-the initial foot positions are 0, because all clips of a shipped library start in the same pose.
+weights scale with the spread of each feature over the library; here they are fixed. The initial foot
+positions tell steps after a stand from steps after a step; in most shipped libraries they are equal.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FEATURES = (
     *('landing place ahead of the stance foot', 'landing place left of the stance foot'),
     'heading after the step',
 )  # m, m, m, m, m, m, rad; for a walker in right stance
-WEIGHTS = (0.0, 0.0, 0.0, 0.0, 0.54, 0.54, 0.48)  # of the features, 1/m and 1/rad
+WEIGHTS = (*[0.54] * 6, 0.48)  # of the features, 1/m and 1/rad
 _REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # signs of features in left stance
 _FIELDS = archive.forms(
     'labels fiu 2, times fiu 1, poses fiu 3, joints U 1, sizes iu 1, previous fiu 2, features fiu 2, '
