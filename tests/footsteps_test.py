@@ -228,6 +228,38 @@ class PlanTest(parameterized.TestCase):
                 sizes = length_and_width(feet[:, stance], after[:, 0], headings, 1 - stance)
                 np.testing.assert_allclose(sizes, [[0.5] * 4, [0.15] * 4], atol=1e-9)
 
+    @parameterized.parameters((3, 1.0), (6, 0.3))
+    def test_plans_stop_and_stay(self, stay, stop):
+        # The walkers stand still, with the feet far from the places of their plans.
+        plans = {'stop': stop, 'stay': (stay, stay), 'width': (0.2, 0.2), 'turn': 0.3, 'sharp': 0.0}
+        environments, found = walked(40, 12, plans=plans)
+        feet, lasted, began = environments.task.body.measure().feet, np.zeros(40, int), []
+        for _, before, after, headings, stance in found:
+            stays = np.abs(after[:, 1] - feet[:, stance])[:, :2].max(1) < 1e-9
+            sizes = length_and_width(feet[:, stance], after[:, 0], headings, 1 - stance)
+            np.testing.assert_allclose(
+                np.array(sizes)[:, stays].T, [[0, 0.2]] * stays.sum(), atol=1e-9
+            )
+            np.testing.assert_array_equal(before[stays], headings[stays])
+            self.assertTrue((before != headings)[~stays].all())
+            free = lasted % stay == 0
+            self.assertTrue(stays[~free].all())  # until the time is over
+            began.extend(stays[free])
+            lasted = np.where(stays, lasted + 1, 0)
+        deviation = np.sqrt(stop * (1 - stop) / len(began))
+        self.assertAlmostEqual(np.mean(began), stop, delta=4 * deviation)
+
+    @parameterized.parameters(False, True)
+    def test_a_walker_that_stays_is_to_stand(self, mirrored):
+        phase = 0.49 if mirrored else 0.99  # at the end of a step
+        environment, _ = started(start_phase=phase, style='stand', plans={'stop': 1.0, 'turn': 0.0})
+        task = environment.task
+        [stand] = np.flatnonzero(np.ptp(task.steps.poses, 1).max(1) == 0)
+        put(environment, task.steps.pose(stand, 0.0, mirrored), np.zeros(len(task.body.pose_dof)))
+        environment.step(np.zeros(17))
+        self.assertTrue(environment.info['landed'])
+        self.assertEqual(task.state.track[0], stand + mirrored * len(task.steps))
+
     @parameterized.parameters(
         ({}, 0.1, 0.25), ({'sharp': 1.0}, 1.0, 0), ({'sharp': 0.0, 'turn': 0.1}, 0, 0.1)
     )

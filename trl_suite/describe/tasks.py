@@ -168,6 +168,12 @@ def _plans(task: Any) -> list[str]:
         lines.append(
             f'with probability {plans.from_root:g} the plan is relative to position and heading of the root'
         )
+    if plans.stop:
+        low, high = plans.stay
+        lines.append(
+            f'at a landing, the walker is to stop with probability {plans.stop:g}, and to stay for {low:g} to '
+            f'{high:g} steps'
+        )
     if plans.react:
         lines.append(f'at a landing, the plan moves by {plans.react:g} of the landing error')
     push = task.config.pushes

@@ -74,6 +74,14 @@ class Plans(Config):
         unit='rad',
         at_least=0,
     )
+    stop: float = option(
+        0.0,
+        'probability that the walker is to stop at a landing: the swing foot lands beside the stance foot, '
+        'and both stay; stands with a style that has them',
+        at_least=0,
+        at_most=1,
+    )
+    stay: Range = option(Range(4, 40), 'number of steps for which it then stays', at_least=1)
     react: float = option(
         0.0,
         'share of the landing error by which a plan moves with the walker at each landing: 0, landing '
@@ -121,8 +129,15 @@ class PlanTask(Planned, TrackingTask):
 
     def _replan(self, i: int) -> None:
         """Draws the next plan of a simulation at a switch of stance."""
-        plans, plan, random = self._drawn_plans, self.plan, self._random[i]
+        plans, plan, state, random = self._drawn_plans, self.plan, self.state, self._random[i]
         measurement, stance, turn = self.body.measurement, plan.stance[i], 0.0
+        if plans.stop and not state.staying[i] and random.uniform() < plans.stop:
+            state.staying[i] = round(random.uniform(*plans.stay))
+        if state.staying[i]:
+            state.staying[i] -= 1
+            beside = 0.0, state.width[i]
+            self._lay_both(i, measurement.feet[i, stance, :2], (beside, beside))
+            return
         if plans.from_root and random.uniform() < plans.from_root:
             turn = np.clip(random.normal(0, plans.root_turn), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
             ranges = plans.root_length, plans.root_width
@@ -135,12 +150,12 @@ class PlanTask(Planned, TrackingTask):
             plan.landing[i, :, :2] += plans.react * error
             plan.landing[i, 1, 2] = self.body.heights(np.array([i]), plan.landing[i, 1:, :2])[0]
         if self.goal_given:
-            root, goal = measurement.root[i, :2], self.state.goal
+            root, goal = measurement.root[i, :2], state.goal
             if np.hypot(*(root - goal[i, :2])) < GOAL_REACHED:
                 goal[i] = self.arena.goal(i, random, root, 'near')
         elif plans.sharp and random.uniform() < plans.sharp:
             turn = random.uniform(-np.pi, np.pi)
-            self.state.excused[i] = self.clock.steps[i] + self._grace_steps
+            state.excused[i] = self.clock.steps[i] + self._grace_steps
         elif plans.turn:
             turn = random.normal(0, plans.turn)
         size = self._next_size(i)

@@ -164,7 +164,7 @@ class Footsteps(PlanTask):
         plan.stance[env_ids] = self.phase[env_ids] >= 0.5
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
-        state.excused[env_ids] = 0
+        state.excused[env_ids] = state.staying[env_ids] = 0
         for i in env_ids.tolist():
             self._begin_plan(i)
         align_all(env_ids, self._first_tracks(env_ids), self._pack)
