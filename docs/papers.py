@@ -51,6 +51,7 @@ CONDITIONS = (
 STYLES = {
     'nominal': ('General', {}),
     'in place': ('InPlace', {}),
+    'stand': ('Stand', {}),
     'high knees': ('HighKnees', {
         'soccer': '.19 .56 .51', 'path': '.10 .39 –', 'pillars': '.06 .43 –'}),
     'one straight leg': ('', {
@@ -60,6 +61,10 @@ STYLES = {
         'soccer': '.64 .69 –', 'path': '.43 .44 –', 'pillars': '.43 .45 –'}),
     'sideways lean': ('', {'soccer': '.41 .72 .74'}),
 }  # fmt: skip
+STANDS = (
+    'straight', 'general', 'stops', 'stands', 'stands, pushes of 100 N', 'stands on a ramp of 8 %',
+    'made from the root, on the spot', 'pushes of 150 N',
+)  # fmt: skip
 TASKS = {'soccer': 'Soccer', 'path': 'PathFollowing', 'pillars': 'Forest'}
 
 
@@ -80,6 +85,7 @@ def tables() -> dict[str, dict[str, str]]:
             'footsteps': footsteps(),
             'plans': plans(),
             'styles': styles(),
+            'stands': stands(),
             'transfer': transfer(),
         },
     }
@@ -195,6 +201,15 @@ def styles() -> str:
         'no fall, 150 N',
     )
     return table(('style', *columns), rows)
+
+
+def stands() -> str:
+    of = [stored('footsteps')[f'PD_Biped3D_LLC_{part}_Step-v0'] for part in ('General', 'Stand')]
+    rows = [
+        (name, *(f'{each[name]["survived"]:.0%}, {each[name]["landing"]:.3f} m' for each in of))
+        for name in STANDS
+    ]
+    return table(('plans', 'nominal', 'stand'), rows)
 
 
 def transfer() -> str:

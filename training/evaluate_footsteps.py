@@ -30,6 +30,7 @@ ID = 'PD_Biped3D_LLC_General_Step-v0'
 SECONDS = 20.0  # of an episode
 STEADY = {'turn': 0.0, 'sharp': 0.0}
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'sharp': 0.0}
+STAY = {'stop': 1.0}
 PUSHES = {'force': (150, 150), 'duration': (0.2, 0.2), 'interval': (2.8, 2.8)}  # every 3 s
 BELTS = {
     'Type': 'conveyor3d',
@@ -59,6 +60,10 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     'made from the root': {'plans': {'from_root': 1.0}},
     'made from the root, on the spot': {'plans': {'from_root': 1.0, 'root_length': (0.0, 0.0)}},
     'made from the root, turning about': {'plans': {'from_root': 1.0, 'root_turn': 0.6}},
+    'stops': {'plans': {'sharp': 0.0, 'stop': 0.1}},
+    'stands': {'plans': STAY},
+    'stands, pushes of 100 N': {'plans': STAY, 'pushes': {**PUSHES, 'force': (100, 100)}},
+    'stands on a ramp of 8 %': {'plans': STAY, 'terrain': ramp(0.08)},
     'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
     'pushes of 250 N': {'plans': {'sharp': 0.0}, 'pushes': {**PUSHES, 'force': (250, 250)}},
     'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
@@ -168,7 +173,7 @@ def main() -> None:
         options = dict(CONDITIONS[name])
         row = row_for(arguments.id, options.pop('terrain', None))
         own = suite.find(arguments.id).options.get('plans', {})
-        options['plans'] = {**own, **options['plans']}
+        options['plans'] = {**own, 'stop': 0.0, **options['plans']}
         result = run(row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options)
         print(
             f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '

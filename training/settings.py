@@ -315,6 +315,39 @@ IN_PLACE = {
         footstep_scale=10.0, heading_scale=2.0,
     ),
 }  # fmt: skip
+STANDING = {
+    **STYLED, 'samples': 3e6, 'landing_costs': {'landing_error': 15.0, 'heading_error': 4.0},
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.1, 'stop': 0.05}}, {'plans': {**FREE, 'stop': 0.1}},
+            {'plans': {'stop': 0.3, 'stay': (4, 80)}}, {'plans': {**BY_ROOT, 'stop': 0.1}},
+            {'plans': {**BY_ROOT, 'root_turn': 0.6, 'stop': 0.2}},
+            {'plans': {'stop': 0.2}, 'pushes': pushes(60, 160)},
+            {'plans': {'stop': 0.3}, 'pushes': pushes(60, 120), 'terrain': ramp(0.08)},
+            {'plans': {**FREE, 'stop': 0.1}, 'pushes': pushes(100, 200)},
+        ),
+        footstep_scale=10.0, heading_scale=2.0,
+    ),
+    'further': ({  # with more disturbances, when the style is there
+        'samples': 4e6, 'num_envs': 260, 'minibatch': 1024, 'start_count': 1e9, 'value_first': 1e5,
+        'learning_rate': 1.5e-4, 'last_learning_rate': 2e-5, 'evaluate_every': 4e5,
+        'landing_costs': {'landing_error': 20.0, 'heading_error': 5.0},
+        'stages': together(
+            (
+                {'plans': {'sharp': 0.15, 'stop': 0.05}, 'pushes': pushes(80, 180)},
+                {'plans': {'sharp': 0.2}}, {**STRONG, 'plans': {'sharp': 0.03, 'stop': 0.1}},
+                {'plans': {**FREE, 'stop': 0.1}, 'pushes': pushes(100, 200)},
+                {'plans': {'stop': 0.3, 'stay': (4, 80)}, 'pushes': pushes(60, 160)},
+                {'plans': {'stop': 0.3}, 'pushes': pushes(60, 160), 'terrain': ramp(0.08)},
+                {'plans': {**BY_ROOT, 'stop': 0.1}, 'pushes': pushes(60, 160)},
+                {'plans': {**BY_ROOT, 'root_turn': 0.6, 'stop': 0.2}},
+                {'plans': {'sharp': 0.1, 'stop': 0.1}, 'pushes': pushes(60, 160), 'terrain': BELTS},
+                {'plans': {'sharp': 0.05, 'stop': 0.1}, 'pushes': pushes(60, 160), 'terrain': bumps(0.06)},
+            ),
+            footstep_scale=10.0, heading_scale=2.0,
+        ),
+    },),
+}  # fmt: skip
 # Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
 # of the footstep controller, before it was averaged with the second.
 ON_TRAILS = {
@@ -525,6 +558,7 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STYLED) for name in ('HighKnees', 'StraightLegs', 'ForwardLean')),
     ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
+    ('PD_Biped3D_LLC_Stand_Step-v0', STANDING),
     # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),

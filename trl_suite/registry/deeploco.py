@@ -124,6 +124,7 @@ _STYLES = (
         'InPlace', 'in_place', 'in place',
         plans={'length': (0.0, 0.1), 'turn': 0.2, 'change': 1.0},
     ),
+    _styled('Stand', 'stand', 'and stands still where it is to stay', plans={'stop': 0.1}),
 )  # fmt: skip
 
 PLAN_LIMIT = 400  # footsteps after which an episode is truncated: 200 s
