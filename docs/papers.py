@@ -80,7 +80,7 @@ def tables() -> dict[str, dict[str, str]]:
     return {
         'action_spaces.md': {'returns': action_spaces()},
         'plaid.md': {'final rewards': plaid(0), 'changes': plaid(1)},
-        'terrain_adaptive_gaits.md': {'distances': gaits()},
+        'terrain_adaptive_gaits.md': {'distances': gaits(), 'foresight': foresight()},
         'deeploco.md': {
             'footsteps': footsteps(),
             'plans': plans(),
@@ -144,17 +144,19 @@ def plaid(kind: int) -> str:
     return table(('learner', '', *TERRAINS), rows)
 
 
+def shipped(id: str) -> dict[str, Any]:
+    """Returns the evaluation of the policy that is shipped for a gait environment."""
+    if id in stored('shared'):
+        return stored('shared')[id]['evaluation']
+    record = stored(id)
+    return next(run['evaluation'] for run in record['runs'] if run['seed'] == record['shipped'])
+
+
 def gaits() -> str:
     rows = []
     for name in GAITS:
         id = f'FSM_{name}-v0'
-        if id in stored('shared'):
-            found = stored('shared')[id]['evaluation']
-        else:
-            record = stored(id)
-            found = next(
-                run['evaluation'] for run in record['runs'] if run['seed'] == record['shipped']
-            )
+        found = shipped(id)
         low, high = found['distance_interval']
         default = stored('default_gaits').get(id, {}).get('distance')
         rows.append((
@@ -179,6 +181,15 @@ def plans() -> str:
         for id, found in stored('plans').items() if 'scripted' in found
     ]  # fmt: skip
     return table(('planner', 'score, hand-written', 'score, trained', 'no fall in 200 s'), rows)
+
+
+def foresight() -> str:
+    rows = [
+        (f'`{id}`', f'{shipped(id)["distance"]:.1f}',
+         *(', '.join(f'{metres:.1f}' for metres in found[kind]['metres']) for kind in ('base', 'noisy')))
+        for id, found in stored('foresight').items()
+    ]  # fmt: skip
+    return table(('environment', 'policy, m', 'base actions, m', 'all parameters, m'), rows)
 
 
 def styles() -> str:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import evaluate_footsteps
+import foresight
 import numpy as np
 import oracles
 from absl.testing import absltest
@@ -75,6 +76,18 @@ class OracleTest(absltest.TestCase):
                 self.assertLen(found[kind][name], oracles.BACK)
             some, mean = (found[kind][name] for name in ('prevented', 'tries_that_prevent'))
             self.assertTrue(np.all(np.array(some) >= mean))
+
+    def test_a_search_with_foresight_ends_in_time(self):
+        options = {'autoreset': 'disabled', 'step_limit': None}
+        copies, rng = VectorEnvironment(HOPPER, 24, 1, 3, **options), np.random.default_rng(3)
+        copies.reset()
+        start = copies.get_state([0])
+        metres, cycles = foresight.search(copies, start, (0.0, 0.1), 9.0, 24 * 50, rng)
+        self.assertBetween(metres, 9.0, 12.0)  # a hop is at most 2.4 m long
+        self.assertBetween(cycles, 24 * 4, 24 * 49)
+        shorter = foresight.search(copies, start, (0.0,), 1e3, 24 * 3, np.random.default_rng(3))
+        self.assertBetween(shorter[0], 3.0, 7.2)
+        self.assertEqual(shorter[1], 24 * 3)
 
     def test_a_tracking_policy_falls_again_without_noise(self):
         """Noise prevents a fall if the character gets beyond its place, before or after its time."""
