@@ -5,7 +5,7 @@
 
 The scale of scores is in trl_suite/benchmark/scales.json; the curves and statistics of all learners
 are in docs/benchmark/report.json; the leaderboard is made of the entries in
-docs/benchmark/entries, which CI verifies. With --check nothing is written, and the exit status is 1
+benchmarks/entries, which CI verifies. With --check nothing is written, and the exit status is 1
 if the page is out of date. Needs `pip install 'trl_suite[video]'`.
 """
 
@@ -25,6 +25,7 @@ from trl_suite.util.program import begin_script
 
 DOCS = pathlib.Path(__file__).resolve().parent
 PAGE, FOLDER = DOCS / 'benchmark.md', DOCS / 'benchmark'
+ENTRIES = DOCS.parent / 'benchmarks' / 'entries'
 BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_learner:')
 NONE = 'No result has been stored yet.'
 
@@ -66,7 +67,7 @@ def levels() -> str:
 
 def leaderboard() -> str:
     """Returns the statistics of all entries."""
-    results = [benchmark.read(path) for path in sorted((FOLDER / 'entries').rglob('*.json'))]
+    results = [benchmark.read(path) for path in sorted(ENTRIES.rglob('*.json'))]
     if not results:
         return NONE
     text = table(report(results))
@@ -93,7 +94,12 @@ def pictures(found: dict[str, Any]) -> None:
         right.set(xlabel='score', ylabel='share of runs above')
         left.legend()
         _save(figure, FOLDER / 'curves.svg')
-        figure, grid = pyplot.subplots(3, 4, figsize=(8, 6), sharex=True, layout='constrained')
+        rows = -(-len(found['environments']) // 4)
+        figure, grid = pyplot.subplots(
+            rows, 4, figsize=(8, 2 * rows), sharex=True, sharey=True, layout='constrained'
+        )
+        for axes in grid.flat[len(found['environments']) :]:
+            axes.remove()
         for axes, id in zip(grid.flat, found['environments'], strict=False):
             for i, of in enumerate(found['learners'].values()):
                 for run in of['scores'][id]:
