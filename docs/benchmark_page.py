@@ -66,11 +66,11 @@ def levels() -> str:
 
 
 def leaderboard() -> str:
-    """Returns the statistics of all entries."""
+    """Returns the ranking of all entries."""
     results = [benchmark.read(path) for path in sorted(ENTRIES.rglob('*.json'))]
     if not results:
         return NONE
-    text = table(report(results))
+    text = '\n\n'.join(table(report(results)).split('\n\n')[:2])  # without environments and pairs
     for name in BASELINES:
         text = text.replace(f'| {name}', f'| baseline: {name}')
     return text
