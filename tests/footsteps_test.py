@@ -1,6 +1,7 @@
 """Tests of the tasks that track footsteps, in the plane and in 3D: clock, plans, reward, landings."""
 
 import functools
+import itertools
 
 import numpy as np
 from absl.testing import parameterized
@@ -469,10 +470,13 @@ class RewardTest(parameterized.TestCase):
             found = task.reward_terms[0, 2]
             self.assertAlmostEqual(found, WEIGHTS['end_effector'], delta=1e-3)
 
-    @parameterized.parameters('high_knees', 'straight_legs', 'forward_lean', 'in_place')
-    def test_a_style_is_another_reference(self, style):
-        plain, _ = self.placed(GENERAL, 0.24)
-        environment, _ = self.placed(GENERAL, 0.24, style=style, pose_scale=10.0)
+    @parameterized.parameters(
+        *((style, 0.24) for style in ('high_knees', 'straight_legs', 'forward_lean', 'in_place')),
+        *itertools.product(('one_straight_leg', 'sideways_lean'), (0.24, 0.74)),
+    )
+    def test_a_style_is_another_reference(self, style, phase):
+        plain, _ = self.placed(GENERAL, phase)
+        environment, _ = self.placed(GENERAL, phase, style=style, pose_scale=10.0)
         task, maps = environment.task, (plain.action_map, environment.action_map)
         np.testing.assert_array_equal(*(mapped.action_offset for mapped in maps))
         for found, (name, weight) in zip(task.reward_terms[0], WEIGHTS.items(), strict=True):

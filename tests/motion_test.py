@@ -241,6 +241,7 @@ REFUSED_STEPS = (
     ({'labels': np.zeros((2, 2))}, r'labels: has shape \(2, 2\); expected \(2, 3\)'),
     ({'previous': np.full((2, 3), np.nan)}, r'previous: nan at \[0, 0\]; expected finite'),
     ({'features': [['a'] * 7] * 2}, 'features: expected an array of numbers'),
+    ({'left_poses': np.zeros((2, 7, 16))}, r'left_poses: has shape \(2, 7, 16\); expected \(2, 7, 17\)'),
 )  # fmt: skip
 
 
@@ -327,8 +328,11 @@ class FileTest(FolderTest):
 class StepsTest(FolderTest):
     """Libraries of made-up steps; the shipped ones are tested with the clips."""
 
-    def test_each_query_has_its_own_step_time_and_side(self):
+    @parameterized.parameters(False, True)
+    def test_each_query_has_its_own_step_time_and_side(self, one_sided):
         library = steps()
+        if one_sided:  # the walker turns the other way about and stretches its knee
+            library = dataclasses.replace(library, left_poses=library.poses[::-1])
         index, t = np.array([0, 1, 1, 0]), np.array([0.1, 0.2, 0.5, 0.0])
         mirrored = np.array([False, True, False, True])
         pose = library.pose(index, t, mirrored)
@@ -341,6 +345,9 @@ class StepsTest(FolderTest):
         self.assertEqual(library.pose(0, np.zeros((2, 3))).shape, (2, 3, 17))
         self.assertEqual(library.pose(1, 0.1, [True, False]).shape, (2, 17))
         self.assertEqual(library.velocity(1, 0.1).shape, (14,))
+        self.assertEqual(library.velocity(1, 0.1, [True, False]).shape, (2, 14))
+        left = library.pose(0, 0.5, True)
+        self.assertAlmostEqual(left[0], 1.0 if one_sided else 0.5)
 
     def test_holds_its_ends(self):
         library = steps()
@@ -383,9 +390,11 @@ class StepsTest(FolderTest):
         np.testing.assert_array_equal(library.select(query), (0, 1, 0))
 
     def test_round_trip(self):
-        path, library = self.folder / 'steps_steps.npz', steps()
-        library.save(path)
-        for found in (motion.load_steps(path), motion.load_steps(str(path))):
+        path = self.folder / 'steps_steps.npz'
+        one_sided = dataclasses.replace(steps(), left_poses=steps().poses[::-1])
+        for library, given in ((one_sided, path), (steps(), path), (steps(), str(path))):
+            library.save(path)
+            found = motion.load_steps(given)
             for field in dataclasses.fields(library):
                 np.testing.assert_array_equal(
                     getattr(found, field.name), getattr(library, field.name), field.name

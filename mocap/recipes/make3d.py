@@ -51,9 +51,7 @@ def main(names: list[str]) -> None:
     for library in libraries():
         if not names or library.name in names:
             library.save(MOCAP / f'{library.name}{motion.clip.STEPS_SUFFIX}.npz')
-            character = library.name
-            for style in step3d.STYLES:
-                character = character.removesuffix(f'_{style}')
+            character = step3d.character(library.name)
             for i, label in enumerate(library.labels):
                 found = checks3d.measure(library.clip(i), character, samples=300)
                 print(f'{library.name} {np.round(label, 3)}: {describe(found)}')

@@ -29,6 +29,7 @@ SPARE = 0.0025  # m, largest error of the stance foot; if the leg is shorter, th
 PASSES = 4  # in which it does
 RATE = 120  # frames per second of a walk
 STEP_RATE = 60  # frames per second of a library
+FINE = 2.0**30  # poses are rounded to 1 / FINE where there are two of each step, for smaller files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,28 +67,34 @@ _ROWS = {
         *(0.253, 0.740, -0.299, -5.0, 0.2, -1.003, 0.771, 0.183, 0.10, 0.182, 1.501),
     ),
 }
-# Pitch of pelvis and torso, drop of the pelvis on the swing side, rad; detour of the swing foot, m.
-_POSTURE = {'lean': -0.05, 'torso': -0.02, 'list': 0.07, 'aside': 0.0}
+# Pitch of pelvis and torso, drop of the pelvis on the swing side, lean of the torso to the right, rad;
+# detour of the swing foot, pelvis left of the middle of the feet, m.
+_POSTURE = {'lean': -0.05, 'torso': -0.02, 'list': 0.07, 'tilt': 0.0, 'aside': 0.0, 'yoff': 0.0}
 SHAPES: Mapping[str, Mapping[str, float]] = {
     name: dict(zip(NAMES, row, strict=True)) | _POSTURE for name, row in _ROWS.items()
+}
+_STRAIGHT = {
+    'phl': 0.10,
+    'pht': 0.12,
+    'phm': 0.10,
+    'tto': -0.4,
+    'tmid': 0.3,
+    'lift': 0.08,
+    'aside': 0.28,
+    'list': 0.0,
 }
 # What the steps of a style have instead.
 STYLES: Mapping[str, Mapping[str, float]] = {
     'high_knees': {'lift': 0.28},
-    'straight_legs': {
-        'phl': 0.10,
-        'pht': 0.12,
-        'phm': 0.10,
-        'tto': -0.4,
-        'tmid': 0.3,
-        'lift': 0.08,
-        'aside': 0.28,
-        'list': 0.0,
-    },
+    'straight_legs': _STRAIGHT,
+    'one_straight_leg': {},
+    'sideways_lean': {'tilt': 0.35, 'yoff': 0.04},
     'forward_lean': {'lean': -0.20, 'torso': -0.45, 'xoff': -0.03},
     'in_place': {'xoff': 0.0},
     'stand': {},
 }
+# What the left leg has instead in styles where it moves differently.
+LEFT: Mapping[str, Mapping[str, float]] = {'one_straight_leg': _STRAIGHT}
 
 
 def bump(u: np.ndarray) -> np.ndarray:
@@ -115,6 +122,7 @@ class Node:
 def node(
     made: figure3d.Figure,
     p: Mapping[str, float],
+    behind: Mapping[str, float],
     trail: np.ndarray,
     lead: np.ndarray,
     heading: float,
@@ -123,25 +131,25 @@ def node(
 ) -> Node:
     """Returns the node with `lead` (2,) in front; side 1 if that is the left foot, else -1.
 
-    To stand, all rates are 0 and the feet flat.
+    `p` is the shape of its leg, `behind` that of the other. To stand, all rates are 0 and the feet flat.
     """
     toe, heel, sole = figure3d.FOOT
     e = np.array([np.cos(heading), np.sin(heading)])
     n = side * np.array([-e[1], e[0]])
     forward, outward = (lead - trail) @ e, (lead - trail) @ n
     size = 0.0 if stand else float(np.clip(forward / REFERENCE, 0.15, 1.3))
-    xy = (trail + lead) / 2 + p['xoff'] * e
+    xy = (trail + lead) / 2 + p['xoff'] * e + side * p['yoff'] * n
     velocity = p['kap'] * forward / STEP * e + p['c'] * np.clip(outward, 0, 0.3) * n
     velocity = velocity * (not stand)
     # The lead hip is turned forward; the root is as high as the shorter leg lets it.
-    leg = sum(made.leg)
+    leg, bent = sum(made.leg), max(p['phm'], behind['phm'])
     turn = figure3d.yaw(np.array(heading - side * ROTATION * size)) @ figure3d.pitch(
         np.array(p['lean'])
     )
-    heights = [sole + leg * np.cos(p['phm'] / 2) - 0.005]
+    heights = [sole + leg * np.cos(bent / 2) - 0.005]
     for foot, bend, tilt, corner, lateral in (
         (lead, p['phl'], p['ths'], heel, side),
-        (trail, p['pht'], p['th1'], toe, -side),
+        (trail, behind['pht'], p['th1'], toe, -side),
     ):
         hip = turn @ made.joint('left_hip' if lateral > 0 else 'right_hip')
         shift = figure3d.rolled(np.array(tilt * size), corner)
@@ -149,25 +157,32 @@ def node(
         upright = np.sqrt((leg * np.cos(bend / 2)) ** 2 - gap @ gap)
         heights.append(float(sole + shift[1] + upright - hip[2]))
     z = min(heights)
-    swing = max(sole + leg * np.cos(p['phm'] / 2) - z, 0.004) / 2 * (2 * np.pi / STEP) ** 2
+    swing = max(sole + leg * np.cos(bent / 2) - z, 0.004) / 2 * (2 * np.pi / STEP) ** 2
     return Node(xy, velocity, size, z, p['vzn'] * size, p['azs'] * swing * (not stand))
 
 
 def step(
-    made: figure3d.Figure, p: Mapping[str, float], previous: Step, this: Step, u: np.ndarray
+    made: figure3d.Figure,
+    p: Mapping[str, float],
+    previous: Step,
+    this: Step,
+    u: np.ndarray,
+    left: Mapping[str, float] | None = None,
 ) -> figure3d.Bodies:
     """Returns a step in right stance at shares `u` of its duration, (n,).
 
-    The stance foot is at the origin; the heading is along x at the start.
+    The stance foot is at the origin; the heading is along x at the start. `left` is the shape of the left
+    leg, if it is another.
     """
+    left = left or p
     u = u * (not (previous.stand and this.stand))
     right = np.zeros(2)
     cos, sin = np.cos(previous.turn), np.sin(previous.turn)
     back = np.array([previous.length, -previous.width])
     trail = -np.array([cos * back[0] - sin * back[1], sin * back[0] + cos * back[1]])
     land = np.array([this.length, this.width])
-    start = node(made, p, trail, right, 0.0, -1, previous.stand)
-    end = node(made, p, right, land, this.turn, 1, this.stand)
+    start = node(made, p, left, trail, right, 0.0, -1, previous.stand)
+    end = node(made, left, p, right, land, this.turn, 1, this.stand)
     size = (start.size + end.size) / 2
 
     # Pelvis and torso.
@@ -187,11 +202,12 @@ def step(
     pelvis = (
         figure3d.yaw(heading + turn)
         @ figure3d.pitch(0 * u + p['lean'])
-        @ figure3d.roll(-p['list'] * bump(u))
+        @ figure3d.roll(-left['list'] * bump(u))
     )
     torso = figure3d.yaw(heading - COUNTER * turn) @ figure3d.pitch(0 * u + p['torso'])
+    torso = torso @ figure3d.roll(0 * u + p['tilt'])
 
-    feet = {'right': _stance(p, start, end, u), 'left': _swing(p, start, end, trail, land, u)}
+    feet = {'right': _stance(p, start, end, u), 'left': _swing(left, start, end, trail, land, u)}
     yaws = {
         'right': 0 * u - TOE_OUT,
         'left': TOE_OUT + previous.turn + (this.turn - previous.turn) * _travel(p, u),
@@ -295,19 +311,26 @@ def library(name: str, shape: str = '', style: str = '') -> motion.FootstepLibra
 
     The steps are straight, wide and turning, all after `USUAL`, except those of `OWN`.
     """
-    made, p = figure3d.figure(name), SHAPES[shape or name] | STYLES.get(style, {})
+    made, usual = figure3d.figure(name), SHAPES[shape or name]
+    right = usual | STYLES.get(style, {})
+    left = usual | LEFT[style] if style in LEFT else right
+    reflected = {name: -right[name] for name in ('tilt', 'yoff')}
     pairs = OWN.get(style, [(USUAL, this) for this in LIBRARY])
     u = np.linspace(0, 1, round(STEP_RATE * STEP) + 1)
-    poses, labels, features = [], [], []
+    poses, labels, features, others = [], [], [], []
     for before, this in pairs:
-        bodies = step(made, p, before, this, u)
+        bodies = step(made, right, before, this, u, left)
         poses.append(made.poses(bodies))
         labels.append((this.length, this.width, this.turn))
         features.append(figure3d.features(made, bodies, this.turn))
+        bodies = step(made, left | reflected, before, this, u, right | reflected)
+        others.append(made.poses(bodies))
+    same = np.array_equal(poses, others)
     return motion.FootstepLibrary(
         name=f'{name}_{style}' if style else name,
         times=STEP * u,
-        poses=np.array(poses),
+        poses=np.array(poses) if same else np.round(np.array(poses) * FINE) / FINE,
+        left_poses=None if same else np.round(np.array(others) * FINE) / FINE,
         joints=made.layout.joints,
         sizes=made.layout.sizes,
         labels=np.array(labels),
@@ -343,6 +366,13 @@ OWN: Mapping[str, Sequence[tuple[Step, Step]]] = {
         *((STAND, Step(0.3, 0.15, turn)) for turn in (-0.8, -0.4, 0.4, 0.8)),
     ],
 }
+
+
+def character(library: str) -> str:
+    """Returns the character of a step library by its name."""
+    for style in STYLES:
+        library = library.removesuffix(f'_{style}')
+    return library
 
 
 def clips() -> list[motion.Clip]:

@@ -9,6 +9,7 @@ import figure3d
 import imageio.v3 as imageio
 import mujoco
 import numpy as np
+import step3d
 
 from trl_suite import motion
 
@@ -46,7 +47,7 @@ if __name__ == '__main__':
     name, path = sys.argv[1:]
     name, _, index = name.partition(':')
     if index:
-        picture = strip(motion.load_steps(name).clip(int(index)), name)
+        picture = strip(motion.load_steps(name).clip(int(index)), step3d.character(name))
     else:
         picture = strip(motion.load(name), checks3d.CHARACTERS[name])
     imageio.imwrite(path, picture)

@@ -1,9 +1,10 @@
 """A library of single steps, and the batched selection of the clip nearest to a plan.
 
 Every clip is one step that begins in right stance, when both feet are on the ground, and ends when
-the left foot lands. For left stance the same clips are mirrored. The stance foot (its ankle, where
-the foot is flat on the ground) is over the origin, and the walker's heading is along x at the
-start; the heading of the pelvis oscillates slightly about it.
+the left foot lands. For left stance the same clips are mirrored, or others of the same steps, for a
+walk that is not symmetric. The stance foot (its ankle, where the foot is flat on the ground) is over
+the origin, and the walker's heading is along x at the start; the heading of the pelvis oscillates
+slightly about it.
 
 As in the original (anim/MocapStepController.cpp), clips are selected by seven features, `FEATURES`,
 of the current state and the plan, relative to the current heading of the root. The original's
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import os
 from collections.abc import Callable
 
@@ -38,6 +40,7 @@ _FIELDS = archive.forms(
     'labels fiu 2, times fiu 1, poses fiu 3, joints U 1, sizes iu 1, previous fiu 2, features fiu 2, '
     'description U 0'
 )
+_LEFT = archive.forms('left_poses fiu 3')  # of walks that are not symmetric
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,6 +60,7 @@ class FootstepLibrary:
       features: features of each clip at its start, with its own landing place as the plan,
         shape (k, 7).
       description: one line.
+      left_poses: poses of the same steps in left stance, mirrored, shape (k, n, d); None: `poses`.
 
     Raises:
       ValueError: if a field is malformed; the message names library and field.
@@ -71,6 +75,7 @@ class FootstepLibrary:
     previous: np.ndarray
     features: np.ndarray
     description: str = ''
+    left_poses: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         put, what = functools.partial(object.__setattr__, self), f'steps {self.name!r}'
@@ -81,11 +86,15 @@ class FootstepLibrary:
         put('poses', errors.floats(f'{what}, poses', self.poses))
         if self.poses.ndim != 3 or not len(self.poses):
             raise ValueError(f'{what}, poses: has shape {self.poses.shape}; expected (k, n, d)')
+        two = self.left_poses is not None
+        if two:
+            own = errors.floats(f'{what}, left_poses', self.left_poses, self.poses.shape)
+            put('left_poses', own)
         for field, columns in (('labels', 3), ('previous', 3), ('features', len(FEATURES))):
             array, shape = getattr(self, field), (len(self), columns)
             put(field, errors.floats(f'{what}, {field}', array, shape, LARGEST))
-        for i in range(len(self)):
-            self.clip(i)  # checks the other fields
+        for i, mirrored in itertools.product(range(len(self)), (False, True)[: 1 + two]):
+            self.clip(i, mirrored)  # checks the other fields
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -100,13 +109,18 @@ class FootstepLibrary:
         """The columns of poses and velocities."""
         return Layout('free', self.joints, self.sizes)
 
+    @functools.cached_property
+    def _stances(self) -> np.ndarray:
+        """Poses in right stance, and those in left stance before mirroring, (2, k, n, d)."""
+        return np.stack([self.poses, self.poses if self.left_poses is None else self.left_poses])
+
     def clip(self, index: int, mirrored: bool = False) -> Clip:
         """Returns one step as a clip that does not loop."""
         length, width, turn = self.labels[index]
         clip = Clip(
             f'{self.name}[{index}]',
             self.times,
-            self.poses[index],
+            self._stances[int(mirrored), index],
             'free',
             self.joints,
             self.sizes,
@@ -125,22 +139,28 @@ class FootstepLibrary:
         Returns:
           Poses, shape (..., d).
         """
+        return _mirrored(mirrored, self._blend(index, t, mirrored), self.layout.mirror.pose)
+
+    def velocity(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
+        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends."""
+        which, time, mirrored = np.broadcast_arrays(index, np.asarray(t, dtype=float), mirrored)
+        time = np.clip(time, 0, self.duration)
+        start = np.maximum(time - VELOCITY_STEP / 2, 0)
+        end = np.minimum(time + VELOCITY_STEP / 2, self.duration)
+        change = self.layout.change(*self._blend(which, np.stack([start, end]), mirrored))
+        velocity = change / (end - start)[..., None]
+        return _mirrored(mirrored, velocity, self.layout.mirror.velocity)
+
+    def _blend(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike) -> np.ndarray:
+        """Returns what `pose` does, before mirroring."""
         which, time = np.broadcast_arrays(np.asarray(index), np.asarray(t, dtype=float))
         time = np.clip(time, 0, self.duration)
         i = np.clip(np.searchsorted(self.times, time, side='right') - 1, 0, self.times.size - 2)
         u = (time - self.times[i]) / (self.times[i + 1] - self.times[i])
-        poses = self.layout.blend(self.poses[which, i], self.poses[which, i + 1], u)
-        return _mirrored(mirrored, poses, self.layout.mirror.pose)
-
-    def velocity(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends."""
-        which, time = np.broadcast_arrays(np.asarray(index), np.asarray(t, dtype=float))
-        time = np.clip(time, 0, self.duration)
-        start = np.maximum(time - VELOCITY_STEP / 2, 0)
-        end = np.minimum(time + VELOCITY_STEP / 2, self.duration)
-        change = self.layout.change(*self.pose(which, np.stack([start, end])))
-        velocity = change / (end - start)[..., None]
-        return _mirrored(mirrored, velocity, self.layout.mirror.velocity)
+        left = np.asarray(mirrored, dtype=int)
+        return self.layout.blend(
+            self._stances[left, which, i], self._stances[left, which, i + 1], u
+        )
 
     def select(self, query: np.ndarray, weights: ArrayLike = WEIGHTS) -> np.ndarray:
         """Returns the clip nearest to each query.
@@ -156,7 +176,8 @@ class FootstepLibrary:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the library as .npz without pickled objects; replaces an existing file at the end."""
-        archive.write(path, {field: getattr(self, field) for field in _FIELDS})
+        found = {field: getattr(self, field) for field in (*_FIELDS, *_LEFT)}
+        archive.write(path, {field: value for field, value in found.items() if value is not None})
 
 
 def features(
@@ -209,7 +230,8 @@ def load(path_or_name: str | os.PathLike[str]) -> FootstepLibrary:
     arrays = archive.arrays(path, 'step library')
     with errors.naming(path):
         name = path.stem.removesuffix(STEPS_SUFFIX)
-        return FootstepLibrary(name, **archive.fields(arrays, _FIELDS))
+        forms = {**_FIELDS, **(_LEFT if arrays.keys() & _LEFT.keys() else {})}
+        return FootstepLibrary(name, **archive.fields(arrays, forms))
 
 
 def names() -> list[str]:
