@@ -534,6 +534,30 @@ class ControllerTest(FolderTest):
         with self.assertRaisesRegex(TypeError, "^'set' object is not callable"):
             self.positions(controller=lambda observation: set()())
 
+    def test_an_action_selects_one_of_several(self):
+        ids = [hierarchical.CONTROLLER, 'PD_Biped3D_LLC_HighKnees_Step-v0']
+        options = {'start_phases': (0.0, 0.5), 'random': 3}
+        plan = policies.reference(FOREST)
+        # Of equal numbers the first counts, also beyond the limits of actions.
+        for id_, choice in zip(ids, ((2.0, 3.0), (-0.1, 0.1)), strict=True):
+            several, _ = started(PLANE, controller=ids, **options)
+            one, expected = started(PLANE, controller=id_, **options)
+            for _ in range(4):
+                action = plan(expected.observation)
+                expected = one.step(action)
+                found = several.step(np.append(action, choice))
+            for name, value in expected.observation.items():
+                np.testing.assert_array_equal(found.observation[name], value)
+        names = several.action_map.names
+        self.assertEqual(names, (*hierarchical.PLAN_NAMES, 'controller_0', 'controller_1'))
+        np.testing.assert_array_equal(several.task.mirror.action_sign, (1, -1, 1, -1, -1, 1, 1))
+        with self.assertRaisesRegex(ValueError, 'takes the footstep plan of .*controller_1'):
+            plan.check(several)
+        for bad in ([], ids):
+            interface = 'frame' if bad else 'plan'
+            with self.assertRaisesRegex(ValueError, f'controller: a list of {len(bad)}'):
+                started(PLANE, controller=bad, interface=interface)
+
     def test_another_body_is_a_warning(self):
         shipped = policies.reference(hierarchical.CONTROLLER)
         with warnings.catch_warnings():

@@ -195,7 +195,7 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
             careful = abs(bend) > BEND or free[map_.middle] < CLOSE
             length[k] = CAUTIOUS if careful else 1.0
         way = wrap(np.arctan2(off[:, 1], off[:, 0]) - heading)
-        footsteps = scripted.steps(way, step_length * length, stance, step_length)
+        footsteps = scripted.steps(way, step_length * length, stance, step_length, len(action_map))
         return np.clip(action_map.action(footsteps), -1, 1)
 
     return plan

@@ -220,7 +220,7 @@ def begin_with(
 
     Args:
       other: the policy.
-      network_: gets its weights; those of inputs that the policy does not have become 0.
+      network_: gets its weights; those of inputs and last outputs that the policy lacks become 0.
       scales: get its mean and deviation.
       places: columns of the points whose Cartesian coordinates are inputs; see `policies.placed`.
       count: sample count of the scales that are copied.
@@ -260,7 +260,11 @@ def begin_with(
         other, network_[0], entry[scales.kept], scales.gain[scales.kept, None]
     )
     first = np.where((entry >= 0)[:, None], other.weights[0][entry] / gain, 0.0)
-    _copy(linear(network_), (first, *other.weights[1:]), other.biases, (1, 0))
+    *hidden, last = linear(network_)
+    more = last.out_features - len(other.biases[-1])
+    weights = first, *other.weights[1:-1], np.pad(other.weights[-1], ((0, 0), (0, more)))
+    biases = *other.biases[:-1], np.pad(other.biases[-1], (0, more))
+    _copy([*hidden, last], weights, biases, (1, 0))
 
 
 def _copy(layers: Iterable[Any], weights: Any, biases: Any, axes: tuple[int, ...]) -> None:

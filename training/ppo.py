@@ -170,7 +170,8 @@ class Trainer:
     def begin_with(self, other: policies.Policy) -> None:
         """Copies weights, scales and noise of a policy, by observation blocks."""
         acts, s = self.environments.action_map, self.settings
-        if (other.actions, other.quantity) != (tuple(acts.names), acts.quantity):
+        shared = tuple(acts.names[: len(other.actions)])
+        if (other.actions, other.quantity) != (shared, acts.quantity):
             raise ValueError(f'{self.spec.id} has other actions than {other.id}')
         hidden = tuple(len(bias) for bias in other.biases[:-1])
         if (hidden, other.activation) != (s.hidden, s.activation):
@@ -178,7 +179,7 @@ class Trainer:
                 f'hidden: {s.hidden} {s.activation}, but {other.id} has {hidden} {other.activation}'
             )
         networks.begin_with(other, self.policy, self.scales, self.places, s.start_count)
-        self.log_std.data.copy_(torch.from_numpy(other.log_std.copy()))
+        self.log_std.data[: len(shared)].copy_(torch.from_numpy(other.log_std.copy()))
         if s.start_std is not None:
             self.log_std.data.fill_(float(np.log(s.start_std)))
 

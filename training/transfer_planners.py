@@ -1,9 +1,13 @@
-"""Trains the planner of a task on for another footstep controller (DeepLoco, supplement, table 3).
+"""Trains the planner of a task on for other footstep controllers (DeepLoco, supplement, table 3).
 
     python training/transfer_planners.py PD_Biped3D_HLC_Soccer-v0 PD_Biped3D_LLC_HighKnees_Step-v0
+    python training/transfer_planners.py PD_Biped3D_HLC_Soccer-v0 PD_Biped3D_LLC_{General,Stand}_Step-v0
+    python training/transfer_planners.py PD_Biped3D_HLC_Soccer-v0 PD_Biped3D_LLC_{General,Stand}_Step-v0 --each
 
-It starts from the shipped planner, by PPO; an interrupted run continues from its checkpoint in --output.
-The result of `evaluate_plans.py` with this planner and controller is written to trained/plans.json.
+It starts from the shipped planner, by PPO; an interrupted run continues from its checkpoint in --output. With
+several controllers the planner selects one in every step, or with --each it is trained with all of them side
+by side, each in as many simulations. The results of `evaluate_plans.py` with this planner are written to
+trained/plans.json.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import pathlib
+from typing import Any
 
 import evaluate_plans
 import ppo
@@ -24,36 +29,51 @@ SAMPLES = 2.4e5  # footsteps
 EPISODES = 32
 
 
-def fine_tuned(id_: str, controller: str, samples: float) -> Settings:
-    """Returns the settings of a training that continues with a controller."""
-    options = {'controller': controller}
+def fine_tuned(id_: str, samples: float, *controllers: Any) -> Settings:
+    """Returns the settings of a training that continues with controllers, side by side.
+
+    Each is what the option `controller` takes: an id, or a list of ids among which the planner selects.
+    """
+    parts = tuple({'controller': controller} for controller in controllers)
     return dataclasses.replace(
         settings_for(id_), samples=samples, start=id_, start_count=1e6, num_envs=128, minibatch=512,
         last_learning_rate=3e-5, value_first=2e4, value_rate=1e-3, value_goes_on=True, further=(),
-        stages=((0.0, options),), evaluated_with=options, evaluate_every=8e4,
+        stages=((0.0, parts),), evaluated_with=parts[0], evaluate_every=8e4,
     )  # fmt: skip
+
+
+def short(id_: str) -> str:
+    """Returns the name of a footstep controller in its id."""
+    return id_.removeprefix('PD_Biped3D_LLC_').removesuffix('_Step-v0')
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('id', help='of the planned environment')
-    parser.add_argument('controller', help='id of the environment of the footstep controller')
+    parser.add_argument(
+        'controllers', nargs='+', help='ids of the environments of the footstep controllers'
+    )
+    parser.add_argument('--each', action='store_true', help='train with each, instead of selecting')
     parser.add_argument('--samples', type=float, default=SAMPLES, help='footsteps')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     arguments = parser.parse_args()
-    id_, controller = suite.find(arguments.id).id, suite.find(arguments.controller).id
-    folder = arguments.output / f'{id_}_with_{controller}' / f'seed_{arguments.seed}'
-    settings = fine_tuned(id_, controller, arguments.samples)
-    ppo.train(id_, arguments.seed, settings, folder, 1)
+    id_, ids = suite.find(arguments.id).id, [suite.find(each).id for each in arguments.controllers]
+    parts: list[Any] = ids if arguments.each or len(ids) == 1 else [ids]
+    how = 'one planner, ' * arguments.each + 'fine-tuned with '
+    names = '_'.join([*map(short, ids), *['each'] * arguments.each])
+    folder = arguments.output / f'{id_}_with_{names}' / f'seed_{arguments.seed}'
+    ppo.train(id_, arguments.seed, fine_tuned(id_, arguments.samples, *parts), folder, 1)
     policy = policies.load(folder / 'policy.npz')
-    result = evaluate_plans.run(
-        id_, lambda environments: policy, EPISODES, 0, controller=controller
-    )
-    found = runs.read('plans.json')
-    found.setdefault(id_, {})[f'fine-tuned with {controller}'] = result
-    runs.write('plans.json', found)
-    print({name: round(value, 3) for name, value in result.items()})
+    for controller in parts:
+        result = evaluate_plans.run(
+            id_, lambda environments: policy, EPISODES, 0, controller=controller
+        )
+        under = how + (controller if isinstance(controller, str) else ', '.join(controller))
+        found = runs.read('plans.json')
+        found.setdefault(id_, {})[under] = result
+        runs.write('plans.json', found)
+        print(under, {name: round(value, 3) for name, value in result.items()})
 
 
 if __name__ == '__main__':

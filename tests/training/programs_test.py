@@ -404,9 +404,9 @@ class FootstepsTest(parameterized.TestCase):
 class PlannerTransferTest(absltest.TestCase):
     def test_starts_from_the_shipped_planner_with_the_controller(self):
         id_, controller = 'PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_HighKnees_Step-v0'
-        given = transfer_planners.fine_tuned(id_, controller, 1e5)
+        given = transfer_planners.fine_tuned(id_, 1e5, controller)
         trainer = ppo.Trainer(id_, 0, dataclasses.replace(given, num_envs=2), 1)
-        walker = trainer.environments.task.controller.policy
+        walker = trainer.environments.task.controllers[0].policy
         self.assertEqual(walker.id, policies.reference(controller).id)
         seen, left = trainer.seen(trainer.observation)
         actions = np.clip(trainer.unmirrored(trainer.means(seen), left), -1, 1)

@@ -17,6 +17,7 @@ from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.common import goals
 from trl_suite.tasks.navigation import direct, hierarchical_rules
+from trl_suite.tasks.navigation.hierarchical import CHOICE, PLAN_NAMES
 from trl_suite.tasks.rewards import fall_condition
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
@@ -189,6 +190,8 @@ def _plan_action(environment: Environment) -> Section:
     """Returns the table of what each action plans."""
     names = environment.action_map.names
     meanings = [_MEANINGS.get(name, 'action of the footstep controller') for name in names]
+    for k, controller in enumerate(environment.task.controllers if CHOICE + '0' in names else ()):
+        meanings[len(PLAN_NAMES) + k] = f'the largest selects the controller; {controller.name}'
     return actions(environment.action_map, ('sets', 'unit and meaning'), meanings)
 
 
@@ -196,8 +199,8 @@ def _planning(spec: EnvSpec, task: Any) -> Iterator[Section]:
     """Yields the sections on controller, start, goal, reward and termination."""
     yield section(
         'Footstep controller',
-        f'{task.controller.name}; plans are relative to position and heading of the root at the beginning of '
-        'a footstep',
+        f'{", ".join(each.name for each in task.controllers)}; plans are relative to position and heading of '
+        'the root at the beginning of a footstep',
     )
     yield _start(spec)
     if task.ball:

@@ -116,7 +116,9 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
 
 def _policy(name: str, source: Any) -> Any:
-    """Returns the policy shipped for an id or alias; other sources are returned unchanged."""
+    """Returns the policy shipped for an id or alias, or a list of them; other sources are unchanged."""
+    if isinstance(source, (list, tuple)):
+        return [_policy(name, each) for each in source]
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
     if source not in BY_ID and source not in ALIASES:

@@ -56,6 +56,7 @@ FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 # at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
 PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
+CHOICE = 'controller_'  # and an index: actions that select one of several controllers
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
@@ -71,7 +72,7 @@ class HierarchicalConfig(GroundConfig):
         CONTROLLER,
         (
             'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
-            'of its file, or a function'
+            'of its file, or a function; or a list of them, of which every action selects one'
         ),
         policy=True,
     )
@@ -122,9 +123,11 @@ class HierarchicalNavigation(Planned, GoalTask):
     next, half a cycle of the footstep controller that controls the joints; the first step of an
     episode may be shorter. A plan has the landing place of the swing foot, the next landing place
     of the stance foot, and a heading, relative to position and heading of the root at the beginning
-    of the step.
+    of the step. With several footstep controllers, an action also has a number for each; the largest
+    selects the controller of the step.
 
     Attributes:
+      controllers: the footstep controllers.
       watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """
 
@@ -162,20 +165,30 @@ class HierarchicalNavigation(Planned, GoalTask):
         self.ball, self.goal_distance = ball, config.goal_distance
         self.terms = soccer_terms() if ball else rules.NAVIGATION_TERMS
         super().__init__(character, arena, steps, config, actuation_model)
-        self.controller = footstep_controller.load(config.controller)
+        given = config.controller
+        several = isinstance(given, (list, tuple))
+        self.controllers = [*map(footstep_controller.load, given if several else [given])]
         self._controller_blocks: tuple[Block, ...] = (*self.body.blocks, PHASE, CONTACT, PLAN)
-        self.controller.check(character.spec, layout(self._controller_blocks), self.joint_map)
+        for each in self.controllers:
+            each.check(character.spec, layout(self._controller_blocks), self.joint_map)
         # A custom function is called on one thread, for all simulations together.
-        self.in_parts = self.controller.policy is not None
+        self.in_parts = all(each.policy is not None for each in self.controllers)
         self.interface, self.step_length = config.interface, config.step_length
         reached = config.goal_reached
         self.goal_reached = (
             (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
         self.steps_vary = by_plan = self.interface == 'plan'
+        count = len(self.controllers)
+        if not count or (count > 1 and not by_plan):
+            raise ValueError(
+                f'controller: a list of {count}, with the interface {self.interface!r}; expected one, or '
+                "several with the interface 'plan'"
+            )
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
-        self.action_map = plan_action_map(self.step_length, None if by_plan else self.joint_map)
+        joints = None if by_plan else self.joint_map
+        self.action_map = plan_action_map(self.step_length, joints, count)
         terrain, *body = body_blocks(character, 'height' in config.terrain_observation)
         controller = Block(
             'low_level',
@@ -193,11 +206,15 @@ class HierarchicalNavigation(Planned, GoalTask):
             controller.observed_if(not by_plan),
         )
         if by_plan and character.spec.mirror:
-            self.mirror = planning_mirror(character, self.observed)
+            self.mirror = planning_mirror(character, self.observed, len(self.action_map))
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
-        return {**super().made_of, 'controller': (self.controller.name, self.controller.policy)}
+        names = ', '.join(each.name for each in self.controllers)
+        return {
+            **super().made_of,
+            'controller': (names, [each.policy for each in self.controllers]),
+        }
 
     def _bind_body(self, world: World) -> rules.PlanningData:
         n, blocks = world.n, self._controller_blocks
@@ -229,6 +246,7 @@ class HierarchicalNavigation(Planned, GoalTask):
             terms=terms_data(rules.NAVIGATION_TERMS),
             by_plan=self.interface == 'plan',
             plan_map=self.action_map.drive(0),
+            controllers=len(self.controllers),
         )
 
     # Episodes.
@@ -274,7 +292,10 @@ class HierarchicalNavigation(Planned, GoalTask):
         going = env_ids
         while len(going):
             if self.interface == 'plan':
-                self._joint_action[going] = self.controller(self._controller_observation[going])
+                for k, controller in enumerate(self.controllers):
+                    led = going[self.state.controller[going] == k]
+                    if len(led):
+                        self._joint_action[led] = controller(self._controller_observation[led])
             self.body.apply_action(self._joint_action, going)
             self.world.step(self.config.substeps, going)
             count = rules.finish_control_steps(going, self._pack)
@@ -313,30 +334,37 @@ class HierarchicalNavigation(Planned, GoalTask):
         return [*plan_markers(env_id, root, self.plan), *super().markers(env_id)]
 
 
-def plan_action_map(step_length: float, joint_map: ActionMap | None = None) -> ActionMap:
+def plan_action_map(
+    step_length: float, joint_map: ActionMap | None = None, controllers: int = 1
+) -> ActionMap:
     """Returns the map from actions to plans.
 
     Args:
       step_length: step length of the plan at action 0, m.
       joint_map: the map of actions to joint targets, with the interface 'frame': these actions
         follow those of the plan, and are passed on as they are.
+      controllers: number of footstep controllers; for several, a number for each follows.
     """
-    names, offset, scale = PLAN_NAMES, step_length * PLAN_OFFSET, PLAN_SCALE
-    if joint_map is not None:
-        names = (*names, *joint_map.names)
-        offset = np.concatenate([offset, np.zeros(len(joint_map))])
-        scale = np.concatenate([scale, np.ones(len(joint_map))])
-    return ActionMap(names, 'footstep plan', 'm (turn: rad)', offset, scale)
+    more = () if joint_map is None else joint_map.names
+    if controllers > 1:
+        more = tuple(f'{CHOICE}{k}' for k in range(controllers))
+    offset = np.append(step_length * PLAN_OFFSET, np.zeros(len(more)))
+    scale = np.append(PLAN_SCALE, np.ones(len(more)))
+    return ActionMap((*PLAN_NAMES, *more), 'footstep plan', 'm (turn: rad)', offset, scale)
 
 
-def planning_mirror(character: Character, blocks: tuple[Block, ...]) -> Mirror:
+def planning_mirror(
+    character: Character, blocks: tuple[Block, ...], actions: int = len(PLAN_NAMES)
+) -> Mirror:
     """Returns the reflection of observations with these blocks, and of plans.
 
     Args:
       character: the character, which has pairs of right and left links.
       blocks: the observation blocks.
+      actions: number of actions; those after the plan are not reflected.
     """
     links = list(character.spec.links)
     feet = [links.index(name) for name in character.spec.end_effectors]
     right, left = layout(blocks)['pose'].start + 1 + LINK_POSE * np.array(feet)
-    return Mirror(*reflected(blocks), *signs(PLAN_SIGNS), feet=(right, left))
+    same = [1.0] * (actions - len(PLAN_SIGNS))
+    return Mirror(*reflected(blocks), *signs((*PLAN_SIGNS, *same)), feet=(right, left))

@@ -60,12 +60,14 @@ class PlanningState(NamedTuple):
       duration: duration of the last step, s.
       down: decaying average of samples with a fall link on the ground.
       over: whether the step is over.
+      controller: index of the footstep controller of this step.
     """
 
     lasted: np.ndarray = WHOLE
     duration: np.ndarray = REAL
     down: np.ndarray = REAL
     over: np.ndarray = FLAG
+    controller: np.ndarray = WHOLE
 
 
 class ControllerData(NamedTuple):
@@ -85,6 +87,7 @@ class PlanningData(NamedTuple):
       terms: the reward terms of a walker's goal; with a ball, those of `aims` are used.
       by_plan: whether a step is a footstep, not a control step.
       plan_map: the map from actions to plans, in m and rad.
+      controllers: number of footstep controllers.
     """
 
     body: BodyData
@@ -100,6 +103,7 @@ class PlanningData(NamedTuple):
     terms: Any
     by_plan: bool
     plan_map: Drive
+    controllers: int
 
 
 # A step: `begin_steps`; then for every control step the action of the footstep controller, physics and
@@ -115,7 +119,10 @@ def measure_walker(i: int, data: PlanningData) -> None:
 
 @compiled
 def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
-    """Sets the plan from the action, relative to the root and its heading, if a footstep begins."""
+    """Sets the plan from the action, relative to the root and its heading, if a footstep begins.
+
+    After the plan, an action has a number for each of several controllers; the largest is selected.
+    """
     plan, measurement, ground = data.plan, data.body.measurement, data.body.ground
     if not (data.by_plan or plan.landed[i] or data.clock.steps[i] == 0):
         return
@@ -129,6 +136,11 @@ def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
         plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
         plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
     plan.heading[i] = heading + in_units(i, 4, action, data.plan_map)
+    best = 0
+    for k in range(1, data.controllers):
+        if in_units(i, 5 + k, action, data.plan_map) > in_units(i, 5 + best, action, data.plan_map):
+            best = k
+    data.state.controller[i] = best
 
 
 @compiled

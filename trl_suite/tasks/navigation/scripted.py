@@ -40,7 +40,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
       environments: a `VectorEnvironment`, or an `Environment`.
 
     Returns:
-      A function from observations, (n, k) with all blocks side by side, to actions (n, 5).
+      A function from observations, (n, k) with all blocks side by side, to actions (n, k).
 
     Raises:
       ValueError: the task is not a high-level one, or has the interface 'frame'.
@@ -61,7 +61,8 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
         bearing, distance = towards_ball(parts) if task.ball else parts['goal'].T
         bearing, room = free_bearing(parts, bearing, distance)
         length = task.step_length * lengths(bearing, distance, room)
-        plan = steps(bearing, length, task.stance, task.step_length)
+        size = len(task.action_map)
+        plan = steps(bearing, length, task.stance, task.step_length, size)
         return np.clip(task.action_map.action(plan), -1, 1)
 
     return policy
@@ -139,14 +140,21 @@ def lengths(bearing: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.n
 
 
 def steps(
-    bearing: np.ndarray, length: np.ndarray, stance: np.ndarray, step_length: float
+    bearing: np.ndarray,
+    length: np.ndarray,
+    stance: np.ndarray,
+    step_length: float,
+    size: int = len(PLAN_NAMES),
 ) -> np.ndarray:
-    """Returns plans (n, 5) in physical units: steps of a length (n,) m along bearings (n,) rad."""
+    """Returns plans (n, size) in physical units: steps of a length (n,) m along bearings (n,) rad.
+
+    Numbers after the plan are 0, which selects the first of several footstep controllers.
+    """
     turn = np.clip(bearing, -TURN / step_length, TURN / step_length)
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)
     ankle = ANKLE / step_length
-    plan = np.zeros((len(bearing), len(PLAN_NAMES)))
+    plan = np.zeros((len(bearing), size))
     plan[:, :2] = (ankle + length)[:, None] * forward + side[:, None] * left
     plan[:, 2:4] = (ankle + 2 * length)[:, None] * forward - side[:, None] * left
     plan[:, 4] = turn
