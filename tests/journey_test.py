@@ -1,7 +1,10 @@
 """Tests of direct navigation: observation, reward, goals, ball, the original."""
 
+import dataclasses
+
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import build, height_map, velocity_map
 
 from trl_suite import suite
 from trl_suite.vector import VectorEnvironment
@@ -10,6 +13,7 @@ TRAIL, FOREST, BLOCKS, MOVERS, SOCCER = (
     f'PD_Biped3D_Terrain_{name}_Hard-v0'
     for name in ('Trail', 'Forest', 'Blocks', 'Dyanmics_Obs', 'Soccer')
 )
+WALK = 'PD_Biped3D_LLC_General_Step-v0'
 GROUNDS = (TRAIL, FOREST, BLOCKS, MOVERS)
 SIZES = {'terrain': 1024, 'pose': 57, 'velocity': 48, 'phase': 5, 'goal': 2}
 
@@ -82,6 +86,37 @@ class ObservationTest(parameterized.TestCase):
         self.assertGreater((maps.max(1) > 2).mean(), 0.9)
         # Clear of them where the walker stands: its own sample is at 0.
         self.assertEqual(np.abs(maps.reshape(16, 32, 32)[:, 15:17, 2:4]).max(), 0)
+
+    @parameterized.parameters(
+        (MOVERS, ('height', 'velocity')),
+        (MOVERS, 'velocity'),
+        (WALK, 'velocity', 'conveyor3d_wide'),
+    )
+    def test_velocities_of_the_ground(self, id_, maps, on=None):
+        spec = suite.find(id_)
+        spec = dataclasses.replace(spec, terrain=on or spec.terrain)
+        environment = build(spec, {'terrain_observation': maps, 'random': 3})
+        environment.reset()
+        for _ in range(20):
+            time_step = environment.step(np.zeros(len(environment.action_map)))
+        place, heading = root_of(environment)
+        around, shown = environment.task.arena.seen(), sizes(environment)
+        at = around, place[None, :2], np.array([heading])
+        self.assertEqual(
+            (shown.get('terrain', 0), shown['surface']), (1024 * (maps != 'velocity'), 2048)
+        )
+        np.testing.assert_allclose(
+            time_step.observation['surface'], velocity_map(*at)[0], atol=1e-9
+        )
+        self.assertGreater(np.abs(time_step.observation['surface']).max(), 0.1)
+        if 'terrain' in shown:
+            np.testing.assert_allclose(
+                time_step.observation['terrain'], height_map(*at)[0], atol=1e-5
+            )
+        mirror, seen = environment.task.mirror, np.concatenate([*time_step.observation.values()])
+        part = environment.blocks['surface']
+        lines = seen[part].reshape(2, 32, 32)[:, ::-1] * np.reshape((1, -1), (2, 1, 1))
+        np.testing.assert_array_equal(mirror.observation(seen[None])[0, part], lines.ravel())
 
 
 class RewardTest(parameterized.TestCase):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +34,9 @@ LINK_POSE, LINK_VELOCITY = 7, 6  # numbers of each link in the blocks pose and v
 _LEVEL = spatial_ground.Capacity(
     level=True, grid=False, boxes=0, belts=0, movers=0, strips=False
 )  # of reference motions
+MAPS = 'height', 'velocity'  # of the ground: what the blocks terrain and surface have
 # Reflection of a map, whose lines are from left to right.
-LINES = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1].ravel()
+_LINES = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1].ravel()
 
 
 class SpatialIds(NamedTuple):
@@ -193,12 +195,15 @@ def measure(i: int, body: BodyData) -> None:
 
 @compiled
 def observe_body(i: int, columns: Any, body: BodyData, observation: np.ndarray) -> None:
-    """Writes the blocks terrain, pose and velocity of a body; see `body_blocks`."""
+    """Writes the blocks terrain, surface, pose and velocity of a body; see `body_blocks`."""
     out = body.measurement
+    x, y, heading = out.root[i, 0], out.root[i, 1], out.heading[i]
     if columns.terrain >= 0:
         block = observation[i, columns.terrain : columns.terrain + SAMPLES * SAMPLES]
-        x, y = out.root[i, 0], out.root[i, 1]
-        spatial_ground.height_map(i, x, y, out.heading[i], body.ground, block)
+        spatial_ground.height_map(i, x, y, heading, body.ground, block)
+    if columns.surface >= 0:
+        block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
+        spatial_ground.velocity_map(i, x, y, heading, body.ground, block)
     if columns.pose >= 0:
         for k in range(out.pose.shape[1]):
             observation[i, columns.pose + k] = out.pose[i, k]
@@ -255,16 +260,16 @@ class SpatialBody(Body):
     arena: SpatialArena
 
     def __init__(
-        self, character: Character, arena: SpatialArena, terrain_observation: bool
+        self, character: Character, arena: SpatialArena, terrain_observation: Collection[str]
     ) -> None:
         """Attaches the character; adds contact sensors for its fall links and end effectors.
 
         Args:
           character: a spatial character; it is attached to the arena and given a free joint.
           arena: the arena with its terrain.
-          terrain_observation: whether ground heights around it are observed, 32 x 32 samples.
+          terrain_observation: maps of the ground that are observed, of `MAPS`.
         """
-        self.character, self.arena, self.terrain_observation = character, arena, terrain_observation
+        self.character, self.arena = character, arena
         (self._root,) = character.create_root_joints(arena.attach(character))
         self._sensors = {
             kind: [
@@ -351,18 +356,31 @@ class SpatialBody(Body):
         return ground
 
 
-def body_blocks(character: Character, terrain_observation: bool) -> tuple[Block, ...]:
-    """Returns the blocks terrain, pose and velocity of a character, as `observe_body` writes them."""
+def body_blocks(character: Character, maps: Collection[str]) -> tuple[Block, ...]:
+    """Returns the blocks terrain, surface, pose and velocity of a character, as `observe_body` writes them.
+
+    Args:
+      character: the character.
+      maps: the maps of the ground that are observed, of `MAPS`.
+    """
     spec = character.spec
     names = list(spec.links)
     links = exchanged(len(names), [(names.index(a), names.index(b)) for a, b in spec.mirror])
     index, sign = mirrored_blocks(links, (*VECTOR, *QUATERNION))
     return (
         Block(
-            'terrain', SAMPLES**2 if terrain_observation else 0, 'm',
+            'terrain', SAMPLES**2 if 'height' in maps else 0, 'm',
             'ground heights relative to the ground under the root, 32 lines from left to right (5.5 m to '
             'each side), each with 32 points from 1 m behind to 10 m ahead', HEIGHTS,
-            Reflection(LINES, np.ones(len(LINES))),
+            Reflection(_LINES, np.ones(len(_LINES))),
+        ),
+        Block(
+            'surface', 2 * SAMPLES**2 if 'velocity' in maps else 0, 'm/s',
+            'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
+            'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then '
+            'all components to the right',
+            HEIGHTS._replace(bias=(0.0, 0.0, 0.0)),
+            Reflection(np.append(_LINES, SAMPLES**2 + _LINES), np.repeat([1.0, -1.0], SAMPLES**2)),
         ),
         Block(
             'pose', LINK_POSE * len(names) + 1, 'm, 1',

@@ -100,7 +100,7 @@ class BodyTask(Task):
             typical = typical_poses(motion, self._first)
         options, muscles = joint_options(character, config, actuation_model, motion, typical)
         if isinstance(arena, SpatialArena):
-            self.body = SpatialBody(character, arena, 'height' in terrain_observation)
+            self.body = SpatialBody(character, arena, terrain_observation)
         else:
             sight = VIEW_BEHIND, VIEW_AHEAD, terrain_observation
             self.body = PlanarBody(

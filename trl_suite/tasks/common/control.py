@@ -12,6 +12,7 @@ import numpy as np
 from trl_suite.actuation import character_muscles
 from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.bodies.reference import joint_targets, mean_targets
+from trl_suite.bodies.spatial import MAPS
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
 from trl_suite.terrain.planar.features import MOST_LENGTH
@@ -36,10 +37,10 @@ def planar_heights() -> Any:
     )
 
 
-def height_map(default: str | tuple[str, ...] = ()) -> Any:
-    """Returns the option of a map of the terrain in three dimensions."""
-    meaning = "observed map of the terrain: 'height', or () for none"
-    return option(default, meaning, choices=('height',))
+def terrain_maps(default: str | tuple[str, ...] = ()) -> Any:
+    """Returns the option of maps of the terrain in three dimensions."""
+    meaning = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
+    return option(default, meaning, choices=MAPS)
 
 
 def physics_steps(least: int) -> Any:
@@ -135,7 +136,7 @@ class PlanarConfig(TrackingConfig):
 class SpatialConfig(TrackingConfig):
     """Options of tasks that track a motion in three dimensions."""
 
-    terrain_observation: str | Collection[str] = height_map()
+    terrain_observation: str | Collection[str] = terrain_maps()
     substeps: int = physics_steps(6)
     action_offset: str = option(
         'clip',

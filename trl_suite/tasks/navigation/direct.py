@@ -21,7 +21,7 @@ from trl_suite.bodies.spatial import SpatialState
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.motion import Clip, FootstepLibrary
-from trl_suite.tasks.common.control import SpatialConfig, height_map
+from trl_suite.tasks.common.control import SpatialConfig, terrain_maps
 from trl_suite.tasks.common.goals import (
     BALL,
     BALL_GOAL,
@@ -181,7 +181,7 @@ def observe_all(env_ids: np.ndarray, data: DirectData) -> None:
 class DirectConfig(SpatialConfig):
     """Options of `DirectNavigation`."""
 
-    terrain_observation: str | Collection[str] = height_map('height')
+    terrain_observation: str | Collection[str] = terrain_maps('height')
     goal_reached: float | None = option(
         None,
         f'distance within which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',

@@ -23,7 +23,7 @@ from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.motion import FootstepLibrary
 from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.common.control import MOST_SUBSTEPS, SUBSTEPS, GroundConfig
+from trl_suite.tasks.common.control import MOST_SUBSTEPS, SUBSTEPS, GroundConfig, terrain_maps
 from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
@@ -60,8 +60,6 @@ CHOICE = 'controller_'  # and an index: actions that select one of several contr
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
-MAPS = ('height', 'velocity')
-TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,7 +80,7 @@ class HierarchicalConfig(GroundConfig):
         'targets, and a plan takes effect only in a step that begins a footstep',
         choices=INTERFACES,
     )
-    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
+    terrain_observation: str | Collection[str] = terrain_maps('height')
     step_length: float = option(
         STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0
     )
@@ -189,7 +187,6 @@ class HierarchicalNavigation(Planned, GoalTask):
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         joints = None if by_plan else self.joint_map
         self.action_map = plan_action_map(self.step_length, joints, count)
-        terrain, *body = body_blocks(character, 'height' in config.terrain_observation)
         controller = Block(
             'low_level',
             sum(block.size for block in self._controller_blocks),
@@ -198,9 +195,7 @@ class HierarchicalNavigation(Planned, GoalTask):
             'the footstep controller has its own observation',
         )
         self.observed = (
-            terrain,
-            rules.SURFACE.observed_if('velocity' in config.terrain_observation),
-            *body,
+            *body_blocks(character, config.terrain_observation),
             BALL_GOAL if ball else GOAL,
             BALL.observed_if(ball is not None),
             controller.observed_if(not by_plan),

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.actuation.action_map import Drive, in_units
-from trl_suite.bodies.blocks import HEIGHTS, Block, Reflection
 from trl_suite.bodies.body import MAX_JOINT_SPEED, BodyData, Travel, write_distance
 from trl_suite.bodies.reference import CONTROL_TIMESTEP, Clock, observe_phase, tick
-from trl_suite.bodies.spatial import LINES, has_diverged, measure, observe_body
+from trl_suite.bodies.spatial import has_diverged, measure, observe_body
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import (
@@ -24,7 +23,6 @@ from trl_suite.tasks.common.goals import (
 )
 from trl_suite.tasks.rewards import FALL_THRESHOLD, Outcome, Term, conclude, give, sample_fall
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled
 
 SPEED_SHARPNESS = 1.5
@@ -37,16 +35,6 @@ NAVIGATION_TERMS = (
         'goal, m/s',
     ),
     Term('upright', UPRIGHT, '1'),
-)
-SURFACE = Block(
-    'surface',
-    2 * SAMPLES**2,
-    'm/s',
-    'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
-    'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then all '
-    'components to the right',
-    HEIGHTS._replace(bias=(0.0, 0.0, 0.0)),
-    Reflection(np.append(LINES, SAMPLES**2 + LINES), np.repeat([1.0, -1.0], SAMPLES**2)),
 )
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
 LONGEST = 60  # limit of control steps per step; the clock switches stance long before
@@ -215,10 +203,6 @@ def observe(i: int, data: PlanningData) -> None:
     body, measurement, columns = data.body, data.body.measurement, data.columns
     observation = data.outcome.observation
     observe_body(i, columns, body, observation)
-    if columns.surface >= 0:
-        block = observation[i, columns.surface : columns.surface + 2 * SAMPLES * SAMPLES]
-        x, y = measurement.root[i, 0], measurement.root[i, 1]
-        spatial_ground.velocity_map(i, x, y, measurement.heading[i], body.ground, block)
     observe_goal(i, columns, body.physics, measurement, data.aims, observation)
     if columns.low_level >= 0:
         observe_for_controller(i, data)

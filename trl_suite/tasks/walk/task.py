@@ -21,10 +21,10 @@ from trl_suite.tasks import parts
 from trl_suite.tasks.common.control import (
     GroundConfig,
     faces,
-    height_map,
     joint_angle,
     physics_steps,
     planar_heights,
+    terrain_maps,
 )
 from trl_suite.tasks.rewards import Outcome, conclude
 from trl_suite.tasks.tracking import BodyTask
@@ -107,7 +107,7 @@ class PlanarWalkConfig(WalkConfig):
 class SpatialWalkConfig(WalkConfig):
     """Options of a walk in three dimensions."""
 
-    terrain_observation: str | Collection[str] = height_map()
+    terrain_observation: str | Collection[str] = terrain_maps()
 
 
 class Walk(BodyTask):
