@@ -54,12 +54,13 @@ STYLES = {
     'stand': ('Stand', {}),
     'high knees': ('HighKnees', {
         'soccer': '.19 .56 .51', 'path': '.10 .39 –', 'pillars': '.06 .43 –'}),
-    'one straight leg': ('', {
+    'one straight leg': ('OneStraightLeg', {
         'soccer': '.51 .64 .45', 'path': '.08 .19 –', 'pillars': '.15 .35 –'}),
     'both legs straight': ('StraightLegs', {'soccer': '.16 .63 –'}),
     'forward lean': ('ForwardLean', {
         'soccer': '.64 .69 –', 'path': '.43 .44 –', 'pillars': '.43 .45 –'}),
-    'sideways lean': ('', {'soccer': '.41 .72 .74'}),
+    'sideways lean': ('SidewaysLean', {'soccer': '.41 .72 .74'}),
+    'nominal or stand': ('General Stand', {}),
 }  # fmt: skip
 STANDS = (
     'straight', 'general', 'stops', 'stands', 'stands, pushes of 100 N', 'stands on a ramp of 8 %',
@@ -192,26 +193,36 @@ def foresight() -> str:
     return table(('environment', 'policy, m', 'base actions, m', 'all parameters, m'), rows)
 
 
+def controllers(names: str) -> str:
+    """Returns the ids of footstep controllers as a key of stored results has them."""
+    return ', '.join(f'PD_Biped3D_LLC_{name}_Step-v0' for name in names.split())
+
+
 def styles() -> str:
     rows = []
     for name, (part, _) in STYLES.items():
-        found = stored('footsteps').get(f'PD_Biped3D_LLC_{part}_Step-v0')
+        found = stored('footsteps').get(controllers(part))
         if found is None:
             continue
         general, pushed = found['general'], found['pushes of 150 N']
         rows.append((
-            name, *(f'{general[key]:.2f}' for key in ('hip_above_knee', 'knee', 'lean')),
+            name, f'{general["hip_above_knee"]:.2f}', pair(general, 'right_knee', 'left_knee'),
+            pair(general, 'lean', 'tilt'),
             f'{general["survived"]:.0%}', f'{general["landing"]:.3f}', f'{pushed["survived"]:.0%}',
         ))  # fmt: skip
     columns = (
         'hip above knee, m',
-        'knee, rad',
+        'knees, rad',
         'lean, rad',
         'no fall',
         'landing error, m',
         'no fall, 150 N',
     )
     return table(('style', *columns), rows)
+
+
+def pair(found: dict[str, Any], *keys: str) -> str:
+    return ' / '.join(f'{round(found[key], 2) + 0.0:.2f}' for key in keys)  # no -0.00
 
 
 def stands() -> str:
@@ -228,10 +239,9 @@ def transfer() -> str:
     for task, part in TASKS.items():
         found = stored('plans')[f'PD_Biped3D_HLC_{part}-v0']
         for name, (controller, published) in STYLES.items():
-            nominal = name == 'nominal'
-            under = '' if nominal else f' with PD_Biped3D_LLC_{controller}_Step-v0'
+            under = '' if name == 'nominal' else f' with {controllers(controller)}'
             ours = [found.get(kind + under) for kind in ('reference', 'fine-tuned')]
-            if task in published or ours[0] is not None:
+            if task in published or any(ours):
                 figures = ('–' if each is None else f'{each["reward"]:.2f}' for each in ours)
                 rows.append((f'{task}, {name}', *published.get(task, '– – –').split(), *figures))
     columns = 'unchanged', 'fine-tuned', 'retrained', 'ours, unchanged', 'ours, fine-tuned'

@@ -84,6 +84,9 @@ OPTIONS = (  # an id or the arguments of `suite.combine`, options; beside those 
     }),
     ('PD_Biped3D_HLC_DynamicsObstacles-v0', {'terrain_observation': ('velocity',)}),
     ('PD_Biped3D_HLC_Soccer-v0', {'goal_distance': (1, 2), 'terrain_observation': ('height',)}),
+    ('PD_Biped3D_HLC_Soccer-v0', {
+        'controller': [f'PD_Biped3D_LLC_{name}_Step-v0' for name in ('General', 'HighKnees', 'Stand')],
+    }),
     ('PD_Biped3D_Terrain_Trail_Hard-v0', {
         'reward': 'original', 'terrain_observation': (), 'goal_reached': 3.0,
     }),

@@ -8,8 +8,8 @@ Prints for every condition, over episodes with the seeds of `evaluation.evaluate
 episodes that last to the end, the mean reward per step (0 after a fall), the distance from planned
 to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
 heading error at landing; and of the posture, the least height of the hip above the knee and the largest
-flexion of the knee in a swing, and the forward lean of the trunk (means). Those of reference policies
-are written to trained/footsteps.json.
+flexion of the knee in a swing, of both legs and of each, and the lean of the trunk, forwards and to the
+right (means). Those of reference policies are written to trained/footsteps.json.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import runs
 
 from trl_suite import policies, suite
 from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.tasks.common.footstep_plan import LEFT, RIGHT
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -83,7 +84,7 @@ def row_for(id_: str, terrain: Any) -> EnvSpec:
 def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the height of each hip above its knee, (n, 2) m, the knees' flexion, (n, 2) rad, and the lean.
 
-    Right before left; the lean, (n,) rad, is that of the trunk forwards.
+    Right before left; the lean, (n, 2) rad, is that of the trunk forwards and to the right.
     """
     names = [*task.character.spec.links]
     places = task.world.xpos[:, task.body.links]
@@ -97,8 +98,8 @@ def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # The pose has the height of the root, then position and orientation of links in the heading frame.
     links = task.body.measurement.pose[:, 1:].reshape(len(places), len(names), 7)
     w, x, y, z = links[:, names.index('torso'), 3:].T
-    lean = np.arcsin(np.clip(2 * (x * z + w * y), -1, 1))
-    return hip[:, :, 2] - knee[:, :, 2], flexion, lean
+    upright = 2 * np.stack([x * z + w * y, w * x - y * z], axis=1)
+    return hip[:, :, 2] - knee[:, :, 2], flexion, np.arcsin(np.clip(upright, -1, 1))
 
 
 def run(
@@ -125,7 +126,7 @@ def run(
         rows = np.arange(episodes)
         swing[0] = np.minimum(swing[0], heights[rows, side])
         swing[1] = np.maximum(swing[1], flexion[rows, side])
-        swings.append(swing[:, landed])
+        swings.append(np.append(swing, side[None], axis=0)[:, landed])
         lean.append(leans[runs])
         swing[:, step.info['landed']] = [[np.inf], [0.0]]
         landing.append(step.info['landing_error'][landed])
@@ -139,13 +140,15 @@ def run(
             observation = environments.reset(ended)
     environments.close()
     errors, turns = np.concatenate(landing), np.concatenate(heading)
-    least, most = np.concatenate(swings, axis=1).mean(1)
+    least, most, leg = np.concatenate(swings, axis=1)
+    forwards, to_the_right = np.concatenate(lean).mean(0).tolist()
     return {
         'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
         'normalized_return': reward / (steps * episodes), 'landing': float(errors.mean()),
         'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
-        'distance': float(distance.mean()), 'hip_above_knee': float(least), 'knee': float(most),
-        'lean': float(np.concatenate(lean).mean()),
+        'distance': float(distance.mean()), 'hip_above_knee': float(least.mean()),
+        'knee': float(most.mean()), 'right_knee': float(most[leg == RIGHT].mean()),
+        'left_knee': float(most[leg == LEFT].mean()), 'lean': forwards, 'tilt': to_the_right,
     }  # fmt: skip
 
 
@@ -179,7 +182,8 @@ def main() -> None:
             f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
             f'heading {result["heading"]:.3f} rad  hip above knee {result["hip_above_knee"]:.2f} m  '
-            f'knee {result["knee"]:.2f}, lean {result["lean"]:.2f} rad',
+            f'knee {result["right_knee"]:.2f} and {result["left_knee"]:.2f}, '
+            f'lean {result["lean"]:.2f} and {result["tilt"]:.2f} rad',
             flush=True,
         )
         if not arguments.policy and not arguments.variant:

@@ -40,7 +40,12 @@ from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
-TEACHERS = {**evaluation.BASELINES, 'expert': expert, 'joint_expert': joint_expert}
+TEACHERS: dict[str, Callable[..., Any]] = {
+    **evaluation.BASELINES,
+    'expert': expert,
+    'joint_expert': joint_expert,
+    'nominal': lambda environments: policies.reference('PD_Biped3D_LLC_General_Step-v0'),
+}
 _STATE = (  # what a checkpoint holds besides what `learnt` returns
     'begun', 'samples', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns', 'steps',
 )  # fmt: skip

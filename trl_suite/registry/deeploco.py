@@ -119,7 +119,9 @@ def _styled(name: str, style: str, words: str, **given: Any) -> EnvSpec:
 _STYLES = (
     _styled('HighKnees', 'high_knees', 'with high knees'),
     _styled('StraightLegs', 'straight_legs', 'with straight legs'),
+    _styled('OneStraightLeg', 'one_straight_leg', 'with a straight left leg'),
     _styled('ForwardLean', 'forward_lean', 'and leans forward'),
+    _styled('SidewaysLean', 'sideways_lean', 'and leans to the right'),
     _styled(
         'InPlace', 'in_place', 'in place',
         plans={'length': (0.0, 0.1), 'turn': 0.2, 'change': 1.0},
