@@ -583,6 +583,8 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', DIRECT),
+    ('PD_Biped3D_Terrain_Dynamic_Obs_Velocity_Hard-v0',  # bound in m and m/s; less data, for memory
+     {'map_bound': 1.0, 'samples': 5e5, 'cloned': 5e5}),
     ('PD_Biped3D_Terrain_Soccer_Hard-v0',
      {'convolutions': (), 'view': None, 'map_bound': 0.0, 'places': ('goal', 'ball')}),
     ('PD_Biped3D_HLC_*', PLANS),

@@ -214,6 +214,11 @@ _JOURNEYS = (
         aliases=('PD_Biped3D_Terrain_Dynamic_Obs_Hard-v0',),
     ),
     _hard(
+        'Dynamic_Obs_Velocity', 'dynamic_obstacles3d',
+        'goes to goals among moving boxes, and observes velocities', original=False,
+        terrain_observation=('height', 'velocity'),
+    ),
+    _hard(
         'Soccer', 'plane', 'dribbles a ball to a goal', original=False, task_type='direct_soccer',
         terrain_observation=(),
     ),
