@@ -179,6 +179,7 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
 EXPERTS = {
     'expert': 'an expert with a map (`training/expert.py`)',
     'joint_expert': 'planned footsteps and the controller that tracks them (`training/expert.py`)',
+    'nominal': 'the policy of [PD_Biped3D_LLC_General_Step-v0](PD_Biped3D_LLC_General_Step-v0.md)',
 }
 
 

@@ -288,7 +288,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'end (256 steps; planned footsteps 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
         'thread of a shared machine. *Initial policy*: where training starts, its samples '
         'not included; or what is imitated first, samples included: `scripted`, the hand-written policy; `expert` and '
-        '`joint_expert`, [experts with a map](../training/expert.py) for footsteps and for joint targets.',
+        '`joint_expert`, [experts with a map](../training/expert.py) for footsteps and for joint targets; `nominal`, '
+        'the policy of `PD_Biped3D_LLC_General_Step-v0`.',
         '## Environments with a policy, except gaits',
         table(
             ('environment', 'return, 95 %', 'mean of seeds', 'complete', 'distance', 'samples', 'minutes',
