@@ -80,7 +80,7 @@ class ListTest(CommandTest):
     @parameterized.parameters(
         ('--domain', 'plad', "unknown domain 'plad'; did you mean 'plaid'"),
         ('--terrain', 'gap_humanoid', "did you mean 'gaps_humanoid'"),
-        ('--tag', 'xyz', "unknown tag 'xyz'; known: blind, completion"),
+        ('--tag', 'xyz', "unknown tag 'xyz'; known: addition, blind"),
     )
     def test_unknown_values(self, name, value, message):
         self.assert_refused(message, 'list', name, value)

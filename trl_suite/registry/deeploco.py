@@ -13,14 +13,14 @@ from trl_suite.registry.spec import EnvSpec
 _FIELDS = {field.name for field in dataclasses.fields(EnvSpec)}
 
 
-def _spec(tags: tuple[str, ...], original: bool = True, **given: Any) -> EnvSpec:
+def _spec(tags: tuple[str, ...], origin: str = 'original', **given: Any) -> EnvSpec:
     """Returns a spec; what is given and is no field of it is an option of the task."""
     options = {name: given.pop(name) for name in [*given] if name not in _FIELDS}
     return EnvSpec(
         domain='deeploco',
         actuation='position',
         options=options,
-        tags=frozenset({*tags, 'original' if original else 'completion'}),
+        tags=frozenset({*tags, origin}),
         **given,
     )
 
@@ -53,7 +53,7 @@ def _step(
 
 _STEP2D = _spec(
     ('planar', 'flat'),
-    original=False,
+    origin='completion',
     id='PD_Biped2D_LLC_Flat_Step-v0',
     task='llc_flat_step',
     character='biped2d_full',
@@ -87,11 +87,11 @@ _STEPS = (
     _step(
         'PD_Biped3D_LLC_Bumps_Step-v0', 'llc_bumps_step',
         'walks along planned footsteps over a raised chequerboard', preset='checkers_3d',
-        original=False,
+        origin='completion',
     ),
     _step(
         'PD_Biped3D_LLC_Trail_Step-v0', 'llc_trail_step',
-        'walks along planned footsteps towards goals on a trail', preset='trail3d2', original=False,
+        'walks along planned footsteps towards goals on a trail', preset='trail3d2', origin='completion',
         goal=True, plans={'length': (0.4, 0.4)},
     ),
     _step(
@@ -110,8 +110,8 @@ _STYLE = (
 def _styled(name: str, style: str, words: str, **given: Any) -> EnvSpec:
     return _step(
         f'PD_Biped3D_LLC_{name}_Step-v0', f'llc_{style}_step',
-        f'walks along planned footsteps {words}', original=False, style=style, pose_scale=10.0,
-        differences=_STYLE, **given,
+        f'walks along planned footsteps {words}', style=style, pose_scale=10.0,
+        **{'origin': 'completion', 'differences': _STYLE, **given},
     )  # fmt: skip
 
 
@@ -126,7 +126,10 @@ _STYLES = (
         'InPlace', 'in_place', 'in place',
         plans={'length': (0.0, 0.1), 'turn': 0.2, 'change': 1.0},
     ),
-    _styled('Stand', 'stand', 'and stands still where it is to stay', plans={'stop': 0.1}),
+    _styled(
+        'Stand', 'stand', 'and stands still where it is to stay', plans={'stop': 0.1},
+        origin='addition', differences=(),
+    ),
 )  # fmt: skip
 
 PLAN_LIMIT = 400  # footsteps after which an episode is truncated: 200 s
@@ -182,10 +185,10 @@ _HIKES = (
         'Conveyors_Wide', 'conveyor3d_wide', 'goes from goal to goal over a wide conveyor belt',
         rate=3000, terrain_observation='velocity', start_phases=_FROM_ZERO,
     ),
-    _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', original=False),
+    _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', origin='completion'),
     _hike(
         'PathFollowing_Run', 'trail3d_wide', 'runs along a wide trail between hills',
-        character='biped3d_mocap_run', original=False, step_limit=RUN_LIMIT,
+        character='biped3d_mocap_run', origin='completion', step_limit=RUN_LIMIT,
         controller='PD_Biped3D_LLC_Run_FootStep-v0', start_phases=_FROM_ZERO, step_length=1.0,
         target_speed=3.0, goal_reached=2.0,
     ),
@@ -215,11 +218,11 @@ _JOURNEYS = (
     ),
     _hard(
         'Dynamic_Obs_Velocity', 'dynamic_obstacles3d',
-        'goes to goals among moving boxes, and observes velocities', original=False,
+        'goes to goals among moving boxes, and observes velocities', origin='addition',
         terrain_observation=('height', 'velocity'),
     ),
     _hard(
-        'Soccer', 'plane', 'dribbles a ball to a goal', original=False, task_type='direct_soccer',
+        'Soccer', 'plane', 'dribbles a ball to a goal', origin='completion', task_type='direct_soccer',
         terrain_observation=(),
     ),
 )  # fmt: skip
