@@ -104,6 +104,15 @@ class PagesTest(FolderTest):
             exec(compile(code, f'{name}.md', 'exec'), {'__name__': 'page'})
         self.assertEqual(besides_notices(told.getvalue()), '')
 
+    def test_readme_counts_environments(self):
+        text = (ROOT / 'README.md').read_text(encoding='utf-8')
+        self.assertIn(f'{len(catalogue.SPECS)} environments in which', text)
+        originals = sum('original' in spec.tags for spec in catalogue.SPECS)
+        self.assertIn(f'\n{originals} of the environments are registered', text)
+        counts = dict(re.findall(r'^\| \[`(\w+)`\].*?\.jpg\) \| (\d+) \|', text, re.MULTILINE))
+        families = [spec.domain for spec in catalogue.SPECS]
+        self.assertEqual(counts, {name: str(families.count(name)) for name in catalogue.FAMILIES})
+
     def test_links_have_targets_and_pictures_are_used(self):
         """Every link target of a page is in the repository, and is not empty."""
         linked = set()
