@@ -1,17 +1,17 @@
-"""Writes the tables and figures of docs/benchmark.md from JSON files in this tree.
+"""Writes the tables and figures of docs/benchmark.md from files in this tree.
 
-    trl-suite benchmark report RESULTS --json docs/benchmark/report.json
     python docs/benchmark_page.py [--check]
 
-The scale of scores is in trl_suite/benchmark/scales.json; the curves and statistics of all learners
-are in docs/benchmark/report.json; the leaderboard is made of the entries in
-benchmarks/entries, which CI verifies. With --check nothing is written, and the exit status is 1
-if the page is out of date. Needs `pip install 'trl_suite[video]'`.
+The scale of scores is in trl_suite/benchmark/scales.json; results are those of the entries in
+benchmarks/entries, which CI verifies. Curves and statistics go into docs/benchmark/report.json. With
+--check nothing is written, and the exit status is 1 if a file is out of date. Needs
+`pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import pathlib
 import sys
 from typing import Any
@@ -30,13 +30,13 @@ BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_
 NONE = 'No result has been stored yet.'
 
 
-def core(found: dict[str, Any] | None) -> str:
+def core(found: dict[str, Any]) -> str:
     """Returns the table of the core set; how hard each is follows from the best learner's score."""
     lines = ['| environment | tests | 0 is | 1 is | best learner |', '|--|--|--:|--:|--:|']
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
         best = '–'
-        if found and id in found['environments']:
+        if id in found['environments']:
             scores = [
                 np.mean([run[-1] for run in of['scores'][id]]) for of in found['learners'].values()
             ]
@@ -65,15 +65,50 @@ def levels() -> str:
     return '\n'.join(lines)
 
 
-def leaderboard() -> str:
-    """Returns the ranking of all entries."""
-    results = [benchmark.read(path) for path in sorted(ENTRIES.rglob('*.json'))]
-    if not results:
-        return NONE
-    text = '\n\n'.join(table(report(results)).split('\n\n')[:2])  # without environments and pairs
+def entries() -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Returns the report of the learners with the most environments, and the results of the others.
+
+    A report counts only environments that are common to its learners.
+    """
+    by_learner: dict[str, list[dict[str, Any]]] = {}
+    for path in sorted(ENTRIES.rglob('*.json')):
+        result = benchmark.read(path)
+        by_learner.setdefault(result['learner'], []).append(result)
+    count = {
+        learner: len({result['environment'] for result in results})
+        for learner, results in by_learner.items()
+    }
+    whole, others = [], []
+    for learner, results in by_learner.items():
+        (whole if count[learner] == max(count.values()) else others).extend(results)
+    return report(whole), others
+
+
+def further(results: list[dict[str, Any]]) -> str:
+    """Returns the table of results that are not in the report."""
+    scores: dict[tuple[str, str], list[float]] = {}
+    for result in results:
+        id = result['environment']
+        score = benchmark.normalised(id, result['scores'][-1][0])
+        scores.setdefault((id, result['learner']), []).append(score)
+    lines = ['| environment | learner | seeds | score |', '|--|--|--:|--:|']
+    for (id, learner), found in sorted(scores.items()):
+        lines.append(f'| `{id}` | {learner} | {len(found)} | {np.mean(found):.3f} |')
+    return '\n'.join(lines)
+
+
+def leaderboard(found: dict[str, Any], others: list[dict[str, Any]]) -> str:
+    """Returns tables and figures of all entries."""
+    text = table(found)
     for name in BASELINES:
-        text = text.replace(f'| {name}', f'| baseline: {name}')
-    return text
+        text = text.replace(f'\n| {name}', f'\n| baseline: {name}', 1)
+    parts = [text, further(others)] if others else [text]
+    return '\n\n'.join((
+        *parts,
+        '![Interquartile mean over samples, and the share of runs above each score](benchmark/curves.svg)',
+        '![Scores in each environment over samples](benchmark/environments.svg)',
+        'All curves: [report.json](benchmark/report.json).',
+    ))  # fmt: skip
 
 
 def pictures(found: dict[str, Any]) -> None:
@@ -114,20 +149,11 @@ def _save(figure: Any, path: pathlib.Path) -> None:
         figure.savefig(part, metadata={'Date': None})
 
 
-def page(found: dict[str, Any] | None, text: str) -> str:
+def page(found: dict[str, Any], others: list[dict[str, Any]], text: str) -> str:
     """Returns the page with tables and figures."""
-    results = NONE
-    if found:
-        results = '\n\n'.join((
-            'All curves are in [report.json](benchmark/report.json).',
-            table(found),
-            '![Interquartile mean over samples, and the share of runs above each score](benchmark/curves.svg)',
-            '![Scores in each environment over samples](benchmark/environments.svg)',
-        ))  # fmt: skip
     for name, content in (
         ('core', core(found)),
-        ('results', results),
-        ('leaderboard', leaderboard()),
+        ('leaderboard', leaderboard(found, others)),
         ('levels', levels()),
     ):
         begin, end = f'<!-- {name}, written by docs/benchmark_page.py -->', f'<!-- /{name} -->'
@@ -141,15 +167,20 @@ def main() -> None:
     parser.add_argument('--check', action='store_true', help='write nothing')
     arguments = parser.parse_args()
     stored = FOLDER / 'report.json'
-    found = files.read_json(stored) if stored.exists() else None
+    found, others = entries()
     old = PAGE.read_text(encoding='utf-8')
-    new = page(found, old)
+    new = page(found, others, old)
     if arguments.check:
-        sys.exit(old != new)
-    if found:
-        pictures(found)
+        sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found))
+    files.write_json(found, stored)
+    pictures(found)
     with files.replacing(PAGE) as part:
         part.write_text(new, encoding='utf-8')
+
+
+def rounded(found: Any) -> Any:
+    """Returns numbers without their last bits, which depend on the processor."""
+    return json.loads(json.dumps(found), parse_float=lambda text: round(float(text), 9))
 
 
 if __name__ == '__main__':
