@@ -241,8 +241,12 @@ def transfer() -> str:
         for name, (controller, published) in STYLES.items():
             under = '' if name == 'nominal' else f' with {controllers(controller)}'
             ours = [found.get(kind + under) for kind in ('reference', 'fine-tuned')]
+            ours.append(found.get(f'one planner, fine-tuned with {controllers(controller)}'))
             if task in published or any(ours):
                 figures = ('–' if each is None else f'{each["reward"]:.2f}' for each in ours)
                 rows.append((f'{task}, {name}', *published.get(task, '– – –').split(), *figures))
-    columns = 'unchanged', 'fine-tuned', 'retrained', 'ours, unchanged', 'ours, fine-tuned'
+    columns = (
+        'unchanged', 'fine-tuned', 'retrained', 'ours, unchanged', 'ours, fine-tuned',
+        'ours, one for all',
+    )  # fmt: skip
     return table(('task, controller', *columns), rows)
