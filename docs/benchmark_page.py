@@ -84,16 +84,23 @@ def entries() -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return report(whole), others
 
 
-def further(results: list[dict[str, Any]]) -> str:
-    """Returns the table of results that are not in the report."""
-    scores: dict[tuple[str, str], list[float]] = {}
+def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[list[float]]]]:
+    """Returns the normalised scores of runs after each part, (runs, 20), by learner and environment."""
+    curves: dict[str, dict[str, list[list[float]]]] = {}
     for result in results:
         id = result['environment']
-        score = benchmark.normalised(id, result['scores'][-1][0])
-        scores.setdefault((id, result['learner']), []).append(score)
+        scores = [benchmark.normalised(id, score) for (score,) in result['scores']]
+        curves.setdefault(result['learner'], {}).setdefault(id, []).append(scores)
+    return curves
+
+
+def further(results: list[dict[str, Any]]) -> str:
+    """Returns the table of results that are not in the report."""
     lines = ['| environment | learner | seeds | score |', '|--|--|--:|--:|']
-    for (id, learner), found in sorted(scores.items()):
-        lines.append(f'| `{id}` | {learner} | {len(found)} | {np.mean(found):.3f} |')
+    for learner, found in curves_of(results).items():
+        for id, runs in found.items():
+            score = np.mean([run[-1] for run in runs])
+            lines.append(f'| `{id}` | {learner} | {len(runs)} | {score:.3f} |')
     return '\n'.join(lines)
 
 
@@ -107,11 +114,11 @@ def leaderboard(found: dict[str, Any], others: list[dict[str, Any]]) -> str:
         *parts,
         '![Interquartile mean over samples, and the share of runs above each score](benchmark/curves.svg)',
         '![Scores in each environment over samples](benchmark/environments.svg)',
-        'All curves: [report.json](benchmark/report.json).',
+        'Curves and statistics: [report.json](benchmark/report.json).',
     ))  # fmt: skip
 
 
-def pictures(found: dict[str, Any]) -> None:
+def pictures(found: dict[str, Any], others: list[dict[str, Any]]) -> None:
     """Draws the curves, all together and of each environment, and the profiles."""
     import matplotlib
     from matplotlib import pyplot
@@ -135,12 +142,18 @@ def pictures(found: dict[str, Any]) -> None:
         )
         for axes in grid.flat[len(found['environments']) :]:
             axes.remove()
+        curves = {learner: of['scores'] for learner, of in found['learners'].items()}
+        curves |= curves_of(others)
+        lines: dict[str, Any] = {}
         for axes, id in zip(grid.flat, found['environments'], strict=False):
-            for i, of in enumerate(found['learners'].values()):
-                for run in of['scores'][id]:
+            for i, (learner, of) in enumerate(curves.items()):
+                for run in of.get(id, ()):
                     axes.plot(samples, run, color=f'C{i}', alpha=0.3, linewidth=0.7)
-                axes.plot(samples, np.mean(of['scores'][id], 0), color=f'C{i}')
+                if id in of:
+                    name = learner.rpartition(':')[2]
+                    (lines[name],) = axes.plot(samples, np.mean(of[id], 0), color=f'C{i}')
             axes.set_title(id.removesuffix('-v0').replace('_Terrain', ''), fontsize=7)
+        figure.legend(lines.values(), lines, loc='outside lower center', ncols=5)
         _save(figure, FOLDER / 'environments.svg')
 
 
@@ -173,7 +186,7 @@ def main() -> None:
     if arguments.check:
         sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found))
     files.write_json(found, stored)
-    pictures(found)
+    pictures(found, others)
     with files.replacing(PAGE) as part:
         part.write_text(new, encoding='utf-8')
 
