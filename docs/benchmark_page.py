@@ -106,12 +106,11 @@ def further(results: list[dict[str, Any]]) -> str:
 
 def leaderboard(found: dict[str, Any], others: list[dict[str, Any]]) -> str:
     """Returns tables and figures of all entries."""
-    text = table(found)
+    title, ranking, rest = table(found).split('\n\n', 2)
     for name in BASELINES:
-        text = text.replace(f'\n| {name}', f'\n| baseline: {name}', 1)
-    parts = [text, further(others)] if others else [text]
+        ranking = ranking.replace(f'\n| {name}', f'\n| baseline: {name}')
     return '\n\n'.join((
-        *parts,
+        title, ranking, rest, *([further(others)] if others else []),
         '![Interquartile mean over samples, and the share of runs above each score](benchmark/curves.svg)',
         '![Scores in each environment over samples](benchmark/environments.svg)',
         'Curves and statistics: [report.json](benchmark/report.json).',
