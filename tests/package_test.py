@@ -163,6 +163,16 @@ class ImportTest(parameterized.TestCase):
         ('import os, trl_suite; print(os.environ["MUJOCO_GL"])', {'MUJOCO_GL': 'osmesa'}, 'osmesa'),
         ('import os; del os.environ["MUJOCO_GL"]; import trl_suite; print(os.environ["MUJOCO_GL"])',
          {'MUJOCO_GL': 'x'}, 'egl'),
+        # Triton, here a broken one, is imported before dm_control's OpenGL.
+        ("""
+            import pathlib, sys, tempfile
+            folder = tempfile.TemporaryDirectory()
+            pathlib.Path(folder.name, 'triton.py').write_text(
+                'import sys; print("OpenGL" in sys.modules); 1 / 0'
+            )
+            sys.path.insert(0, folder.name)
+            import trl_suite.suite
+         """, {'MUJOCO_GL': 'egl'}, 'False'),
     )  # fmt: skip
     def test_imports_without_a_screen(self, code, variables, expected):
         if expected == 'egl' and sys.platform != 'linux':

@@ -6,6 +6,7 @@ environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1}
 time_step = environment.reset()
 """
 
+import contextlib
 import ctypes.util
 import importlib
 import os
@@ -20,6 +21,12 @@ if (
 ):
     # dm_control would choose GLFW, which cannot render without a display. This creates no context.
     os.environ['MUJOCO_GL'] = 'egl'
+
+if os.environ.get('MUJOCO_GL') == 'egl':
+    # PyTorch for CUDA imports Triton at its first optimizer. This ends the process if dm_control has
+    # loaded Mesa before, which has another LLVM; the other order works.
+    with contextlib.suppress(Exception):  # of a broken Triton PyTorch complains
+        importlib.import_module('triton')
 
 __version__ = '0.1.0'
 
