@@ -43,6 +43,7 @@ from torch import nn
 from torch.optim import swa_utils
 
 from trl_suite import policies
+from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 
@@ -58,6 +59,7 @@ class Settings:
     also: tuple[str, ...] = ()
     samples: float = 3e5  # cycles
     num_envs: int = 64
+    substeps: int = gait_rules.SUBSTEPS  # as in `learn_gaits.py`
     horizon: int = 64  # cycles of each simulation between two updates
     sharpness: float = 4.0  # logits per unit of value
     epochs: int = 4
@@ -155,8 +157,8 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
             f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
         )
     own = dataclasses.replace(
-        s.first, also=s.also, num_envs=s.num_envs, start='', capacity=1, greedy=s.greedy,
-        retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
+        s.first, also=s.also, num_envs=s.num_envs, substeps=s.substeps, start='', capacity=1,
+        greedy=s.greedy, retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
     )  # fmt: skip
     learn_gaits.environments_of(id_, own)
     return own

@@ -143,6 +143,12 @@ class RefineTest(FolderTest):
         with self.assertRaisesRegex(ValueError, 'of at most 0.3.*; expected .* of at most 0.2'):
             refine_gaits.Refiner(HOPPER, 1, other, 1, policy)
 
+    def test_training_may_have_a_coarser_physics(self):
+        for substeps, timestep in ((1, 1 / 600), (2, 1 / 1200)):
+            refiner, _ = make(substeps=substeps)
+            task = refiner.learner.environments.task
+            self.assertAlmostEqual(task.physics_timestep, timestep, places=12)
+
     def test_the_value_is_learnt_first(self):
         refiner, _ = make()
         before = refiner.outputs(refiner.seen())[0].detach()
