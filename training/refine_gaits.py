@@ -119,6 +119,12 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Raptor2D_Terrain_Mixed-v0': {
         'samples': 2.5e5, 'retry': 0.7, 'averaged': 0.0, 'evaluate_every': 12288,
     },
+    'FSM_Raptor2D_Terrain_Narrow_Gaps-v0': {
+        'start': 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
+        'also': _terrains('Raptor2D', 'Slopes_Mixed', 'Mixed', 'Gaps', 'Cliffs'), 'num_envs': 75,
+        'substeps': 1, 'samples': 7.2e5, 'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225,
+        'evaluate_every': 49152,
+    },
     'FSM_Hopper2D_Terrain_Mixed-v0': {
         'also': _terrains('Hopper2D', 'Gaps', 'Slopes_Mixed', 'Walls', 'Mixed_Easy'), 'num_envs': 80,
         'samples': 9.9e5, 'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225,
