@@ -107,9 +107,8 @@ def run(
 ) -> dict[str, Any]:
     """Runs one episode in every simulation; returns survival, reward, errors and posture."""
     steps = round(seconds * 30)
-    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     environments = VectorEnvironment(
-        spec, episodes, 0, seeds, autoreset='disabled', step_limit=steps, task_kwargs=options
+        spec, episodes, 0, seed, autoreset='disabled', step_limit=steps, task_kwargs=options
     )
     policy.check(environments)
     observation = environments.reset()
@@ -119,7 +118,7 @@ def run(
     swings, swing = [], np.tile([[np.inf], [0.0]], episodes)  # extremes of the present step
     while runs.any():
         side = 1 - environments.task.stance
-        step = environments.step(policy(observation))
+        step = environments.step(policy(observation), runs)
         reward += float(step.reward[runs].sum())
         landed = step.info['landed'] & runs
         heights, flexion, leans = postures(environments.task)
@@ -136,8 +135,6 @@ def run(
         full[ended & runs] = step.truncated[ended & runs]
         runs &= ~ended
         observation = step.observation
-        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
-            observation = environments.reset(ended)
     environments.close()
     errors, turns = np.concatenate(landing), np.concatenate(heading)
     least, most, leg = np.concatenate(swings, axis=1)

@@ -56,11 +56,10 @@ def run(
     id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int, **options: Any
 ) -> dict:
     """Runs one episode in every simulation; returns the measured quantities."""
-    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     own = 'hierarchical' in catalogue.BY_ID[id_].tags
     limit = -1 if own else round(SECONDS / CONTROL_TIMESTEP)
     environments = VectorEnvironment(
-        id_, episodes, 0, seeds, step_limit=limit, autoreset='disabled', task_kwargs=options
+        id_, episodes, 0, seed, step_limit=limit, autoreset='disabled', task_kwargs=options
     )
     policy, observation = make(environments), environments.reset()
     task, limit = environments.task, environments.step_limit
@@ -77,7 +76,7 @@ def run(
     begin = along_trails(environments, before)
     trail = np.zeros(episodes)
     while runs.any():
-        step = environments.step(policy(observation))
+        step = environments.step(policy(observation), runs)
         info, after = step.info, places()
         reward += step.reward * runs
         duration = info.get('duration', duration)
@@ -94,9 +93,6 @@ def run(
         fell |= step.terminated & runs
         runs &= ~ended
         observation, before = step.observation, after
-        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
-            observation = environments.reset(ended)
-            before = places()
     environments.close()
     return {
         'episodes': episodes, 'seed': seed, 'reward': float(reward.mean() / limit),
