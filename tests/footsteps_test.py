@@ -450,7 +450,7 @@ class RewardTest(parameterized.TestCase):
         put(environment, pose, rate)
         task.plan.landing[0, 0] = *landing[:2], 0
         if id_ != PLANAR:
-            task.heading[0] = heading_of(environment)
+            task.plan.heading[0] = heading_of(environment)
         task.observe()
         return environment, landing
 
@@ -532,7 +532,7 @@ class RewardTest(parameterized.TestCase):
         environment, _ = self.placed(GENERAL, 0.1, heading_scale=scale)
         task = environment.task
         # Plans may turn round and round.
-        task.heading[0] = heading_of(environment) + off + 4 * np.pi
+        task.plan.heading[0] = heading_of(environment) + off + 4 * np.pi
         task.observe()
         expected = WEIGHTS['heading'] * (0.5 + 0.5 * np.cos(counted)) ** 4
         self.assertAlmostEqual(task.reward_terms[0, 5], expected, delta=1e-9)
@@ -566,8 +566,8 @@ class RewardTest(parameterized.TestCase):
         self.assertLess(angle_between(ahead, heading_of(environment)), 1e-4)
         # The step of it is the nearest to the plan among all of the library.
         turn, feet = flattened(heading_of(environment)), ankles(environment)
-        landing = (turn @ (task.landing[0, 0] - feet[LEFT]))[:2] * [1, -1]  # left stance
-        query = np.array([*landing, -(task.heading[0] - heading_of(environment))])
+        landing = (turn @ (task.plan.landing[0, 0] - feet[LEFT]))[:2] * [1, -1]  # left stance
+        query = np.array([*landing, -(task.plan.heading[0] - heading_of(environment))])
         gap = (task.steps.features[:, 4:] - query) * (0.54, 0.54, 0.48)
         self.assertEqual(int(task.state.track[0]), int((gap**2).sum(1).argmin()) + len(task.steps))
         assert_refused(self, (lambda: task.clip_action(0), 'footsteps have no clip to follow'))

@@ -123,7 +123,7 @@ class ClockTest(parameterized.TestCase):
             self.assertAlmostEqual(data.time - before, count / 30, delta=1e-9)
             self.assertLen(calls, count)
             np.testing.assert_allclose(np.diff([before, *calls]), 1 / 30, atol=1e-9)
-            self.assertEqual(task.stance[0], stance)
+            self.assertEqual(task.plan.stance[0], stance)
             self.assertTrue(environment.info['landed'])
 
     def test_start_phases_are_drawn_evenly(self):
@@ -147,30 +147,36 @@ class PlanTest(parameterized.TestCase):
             action = 0.15 * rng.uniform(-1, 1, 5)
             plan = np.array([0.5, 0, 1, 0, 0]) + np.array([1, 1, 2, 2, np.pi]) * action
             seen = []
-            task.watch = lambda seen=seen: seen.append((*task.landing[0].ravel(), task.heading[0]))
+            task.watch = lambda seen=seen: seen.append(
+                (*task.plan.landing[0].ravel(), task.plan.heading[0])
+            )
             environment.step(action)
             self.assertLen(seen, 15)
             self.assertGreater(np.hypot(*(body(environment, 'xpos', 'root') - root)[:2]), 0.1)
             for which, way in enumerate((plan[:2], plan[2:4])):
-                place = task.landing[0, which]
+                place = task.plan.landing[0, which]
                 np.testing.assert_allclose(place[:2], root[:2] + turned(way, heading), atol=1e-9)
                 # Height grids are stored in single precision.
                 height = float(ground(environment, *place[:2]))
                 self.assertAlmostEqual(place[2], height, delta=1e-5)
-            self.assertLess(angle_between(task.heading[0], heading + plan[4]), 1e-9)
+            self.assertLess(angle_between(task.plan.heading[0], heading + plan[4]), 1e-9)
             np.testing.assert_array_equal(seen, np.tile(seen[0], (15, 1)))
 
     def test_inputs_of_the_controller(self):
         phases, default = [], shipped_controller()
 
         def controller(observation):
-            feet, heading, swing = ankles(environment), heading_of(environment), 1 - task.stance[0]
+            feet, heading, swing = (
+                ankles(environment),
+                heading_of(environment),
+                1 - task.plan.stance[0],
+            )
             slots = observation[0, 112:124].reshape(2, 2, 3)
             for which, foot in enumerate((swing, 1 - swing)):
-                way = turned((task.landing[0, which] - feet[foot])[:2], -heading)
+                way = turned((task.plan.landing[0, which] - feet[foot])[:2], -heading)
                 np.testing.assert_allclose(slots[which, foot, :2], way, atol=1e-9)
                 np.testing.assert_array_equal(slots[which, 1 - foot], 0)
-            off = angle_between(heading + observation[0, 124], task.heading[0])
+            off = angle_between(heading + observation[0, 124], task.plan.heading[0])
             self.assertLess(off, 1e-9)
             phases.append(observation[0, 105])
             return default(observation)
@@ -474,23 +480,23 @@ class FrameTest(parameterized.TestCase):
             np.testing.assert_array_equal(frame.physics.data.qvel, plan.physics.data.qvel)
             for name, value in expected.observation.items():
                 np.testing.assert_array_equal(found.observation[name], value)
-            np.testing.assert_array_equal(frame.task.landing, plan.task.landing)
+            np.testing.assert_array_equal(frame.task.plan.landing, plan.task.plan.landing)
 
     def test_a_plan_takes_effect_at_the_start_of_a_footstep(self):
         environment, _ = started(PLANE, interface='frame')
         task, rng, plans = environment.task, np.random.default_rng(0), []
         for i in range(31):
-            before = task.landing[0].copy(), task.heading[0]
+            before = task.plan.landing[0].copy(), task.plan.heading[0]
             root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
             action = np.append(0.2 * rng.uniform(-1, 1, 5), np.zeros(17))
             self.assertTrue(environment.step(action).mid())
             if i % 15 == 0:
                 place = root[:2] + turned((0.5 + action[0], action[1]), heading)
-                np.testing.assert_allclose(task.landing[0, 0, :2], place, atol=1e-9)
-                plans.append(task.landing[0].copy())
+                np.testing.assert_allclose(task.plan.landing[0, 0, :2], place, atol=1e-9)
+                plans.append(task.plan.landing[0].copy())
             else:
-                np.testing.assert_array_equal(task.landing[0], before[0])
-                self.assertEqual(task.heading[0], before[1])
+                np.testing.assert_array_equal(task.plan.landing[0], before[0])
+                self.assertEqual(task.plan.heading[0], before[1])
             self.assertEqual(environment.info['landed'], i in (14, 29))
         self.assertLen(plans, 3)
 
@@ -669,9 +675,9 @@ class PictureTest(parameterized.TestCase):
         # Every 5 of the 15 control steps; the last of them now.
         self.assertEqual([marker.shape for marker in trace], ['sphere'] * 3)
         np.testing.assert_allclose(trace[-1].position, com_of(environment), atol=1e-6)
-        for marker, place in zip(plan[:2], task.landing[0], strict=True):
+        for marker, place in zip(plan[:2], task.plan.landing[0], strict=True):
             self.assertLess(np.hypot(*(marker.position - place)[:2]), 0.06)
-            self.assertAlmostEqual(marker.yaw, task.heading[0])
+            self.assertAlmostEqual(marker.yaw, task.plan.heading[0])
         self.assertEqual(flag.shape, 'cylinder')
         radius, half_height = flag.size[:2]
         # It stands on the ground at the goal.

@@ -88,9 +88,9 @@ class TaskTest(parameterized.TestCase):
             put(other, mirror.pose(pose), mirror.velocity(rate))
             if case[3] == 'footsteps':
                 places, heading = rng.uniform(-1, 1, (2, 3)), rng.uniform(-3, 3)
-                task.landing[0], task.heading[0] = places, heading
-                other.task.landing[0] = places * [1, -1, 1]
-                other.task.heading[0] = -heading
+                task.plan.landing[0], task.plan.heading[0] = places, heading
+                other.task.plan.landing[0] = places * [1, -1, 1]
+                other.task.plan.heading[0] = -heading
             first, second = observed(environment), observed(other)
             kept = np.ones(len(first), bool)
             if case[3] == 'footsteps':  # contacts are of the last substep
@@ -202,7 +202,7 @@ class PlanTest(parameterized.TestCase):
         np.testing.assert_allclose(mirror.observation(second[None])[0], first, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(
             mirror.left(np.stack([first, second])),
-            [environment.task.stance[0], other.task.stance[0]],
+            [environment.task.plan.stance[0], other.task.plan.stance[0]],
         )
         # At the clamp of an orientation actuator the last bit decides about its damping.
         plan = np.array([0.0, 0.05, 0.0, 0.05, 0.15])
@@ -237,7 +237,7 @@ class PlanTest(parameterized.TestCase):
         plan, observation = scripted.scripted(specs), specs.reset()
         for _ in range(6):
             left = specs.task.mirror.left(observation)
-            np.testing.assert_array_equal(left, specs.task.stance == 1)
+            np.testing.assert_array_equal(left, specs.task.plan.stance == 1)
             observation = specs.step(plan(observation)).observation
 
     def test_tasks_that_also_control_joints_have_no_mirror(self):

@@ -117,7 +117,7 @@ def run(
     landing, heading, lean = [], [], []
     swings, swing = [], np.tile([[np.inf], [0.0]], episodes)  # extremes of the present step
     while runs.any():
-        side = 1 - environments.task.stance
+        side = 1 - environments.task.plan.stance
         step = environments.step(policy(observation), runs)
         reward += float(step.reward[runs].sum())
         landed = step.info['landed'] & runs

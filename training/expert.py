@@ -214,7 +214,7 @@ def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray
             "with the interface 'plan' and without a ball"
         )
     plan = planner(task, task.step_length, task.action_map)
-    return lambda observation: plan(task.world.all_ids, task.stance)
+    return lambda observation: plan(task.world.all_ids, task.plan.stance)
 
 
 def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:

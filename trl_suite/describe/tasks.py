@@ -106,9 +106,8 @@ def fall(task: Any, missed: str = '') -> Section:
 
 def missed(task: Any) -> str:
     """Returns the condition on the landing error; empty if there is none."""
-    if task.max_landing_error is None:
-        return ''
-    return f'a foot lands more than {task.max_landing_error:g} m from its landing place; '
+    limit = task.config.max_landing_error
+    return '' if limit is None else f'a foot lands more than {limit:g} m from its landing place; '
 
 
 def _imitation(spec: EnvSpec, task: Any) -> Iterator[Section]:

@@ -80,31 +80,6 @@ class FootstepPlan(NamedTuple):
     landed: np.ndarray = FLAG
 
 
-class Planned:
-    """Short names for the plan of a task.
-
-    Attributes:
-      plan: the plan of each simulation.
-    """
-
-    plan: FootstepPlan
-
-    @property
-    def stance(self) -> np.ndarray:
-        """Stance foot, `RIGHT` or `LEFT`, (n,)."""
-        return self.plan.stance
-
-    @property
-    def landing(self) -> np.ndarray:
-        """Landing places of the swing foot, then of the stance foot, (n, 2, 3) m."""
-        return self.plan.landing
-
-    @property
-    def heading(self) -> np.ndarray:
-        """Planned heading, (n,) rad."""
-        return self.plan.heading
-
-
 @compiled
 def update_stance(i: int, phase: float, measurement: Measurement, plan: FootstepPlan) -> bool:
     """Switches the stance foot if the phase is in the other half, and writes the landing errors.

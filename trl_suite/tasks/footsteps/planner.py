@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from trl_suite.motion import quaternion
-from trl_suite.tasks.common.footstep_plan import SIDE, Planned
+from trl_suite.tasks.common.footstep_plan import SIDE, FootstepPlan
 from trl_suite.tasks.footsteps.rules import FootstepState
 from trl_suite.tasks.tracking import TrackingTask
 from trl_suite.util.options import Config, Range, option
@@ -91,17 +91,19 @@ class Plans(Config):
     )
 
 
-class PlanTask(Planned, TrackingTask):
+class PlanTask(TrackingTask):
     """A body that tracks footsteps; plans are drawn at the start of an episode and at each landing.
 
     Landing places and headings are written to the plan; sizes of steps, goals, and until when landing
     errors do not count after a sharp turn, to the state.
 
     Attributes:
-      state: state in addition to the plan.
+      plan: plans of the simulations.
+      state: state in addition to the plans.
       goal_given: whether plans lead to goals.
     """
 
+    plan: FootstepPlan
     state: FootstepState
     goal_given = False
     _grace_steps = 0  # control steps after a sharp turn in which landing errors do not count

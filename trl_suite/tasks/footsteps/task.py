@@ -146,11 +146,6 @@ class Footsteps(PlanTask):
         )
 
     @property
-    def max_landing_error(self) -> float | None:
-        """Landing error above which an episode fails, m."""
-        return self.config.max_landing_error
-
-    @property
     def step_phase(self) -> np.ndarray:
         """Share of the single step that has passed, (n,)."""
         twice = 2 * self.phase
@@ -236,7 +231,7 @@ class SpatialFootsteps(Footsteps):
                 self.state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
 
     def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
-        return self._first + len(self.steps) * (self.stance[env_ids] == LEFT)
+        return self._first + len(self.steps) * (self.plan.stance[env_ids] == LEFT)
 
     # A step.
 
@@ -257,11 +252,11 @@ class SpatialFootsteps(Footsteps):
             measurement.heading[env_ids],
             feet[:, RIGHT, :2],
             feet[:, LEFT, :2],
-            self.landing[env_ids, 0, :2],
-            self.heading[env_ids],
-            self.stance[env_ids] == RIGHT,
+            self.plan.landing[env_ids, 0, :2],
+            self.plan.heading[env_ids],
+            self.plan.stance[env_ids] == RIGHT,
         )
-        return self.steps.select(query) + len(self.steps) * (self.stance[env_ids] == LEFT)
+        return self.steps.select(query) + len(self.steps) * (self.plan.stance[env_ids] == LEFT)
 
     # Rendering.
 
@@ -319,10 +314,10 @@ class PlanarFootsteps(Footsteps):
         return reference
 
     def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
-        return self.stance[env_ids]
+        return self.plan.stance[env_ids]
 
     def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
-        return self.stance[env_ids]
+        return self.plan.stance[env_ids]
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places."""

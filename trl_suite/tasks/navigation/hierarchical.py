@@ -28,7 +28,6 @@ from trl_suite.tasks.common.footstep_plan import (
     CONTACT,
     PLAN,
     FootstepPlan,
-    Planned,
     check_two_feet,
     plan_markers,
     pose_of_step,
@@ -114,7 +113,7 @@ class HierarchicalConfig(GroundConfig):
     substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6, at_most=MOST_SUBSTEPS)
 
 
-class HierarchicalNavigation(Planned, GoalTask):
+class HierarchicalNavigation(GoalTask):
     """A spatial biped walks from goal to goal, or dribbles a ball to them, by planning footsteps.
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
@@ -125,6 +124,7 @@ class HierarchicalNavigation(Planned, GoalTask):
     selects the controller of the step.
 
     Attributes:
+      plan: plans of the simulations.
       controllers: the footstep controllers.
       watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """

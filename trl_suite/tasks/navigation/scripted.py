@@ -62,7 +62,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
         bearing, room = free_bearing(parts, bearing, distance)
         length = task.step_length * lengths(bearing, distance, room)
         size = len(task.action_map)
-        plan = steps(bearing, length, task.stance, task.step_length, size)
+        plan = steps(bearing, length, task.plan.stance, task.step_length, size)
         return np.clip(task.action_map.action(plan), -1, 1)
 
     return policy
