@@ -169,8 +169,7 @@ def page(found: dict[str, Any], others: list[dict[str, Any]], text: str) -> str:
         ('levels', levels()),
     ):
         begin, end = f'<!-- {name}, written by docs/benchmark_page.py -->', f'<!-- /{name} -->'
-        before, rest = text.split(begin)
-        text = f'{before}{begin}\n\n{content}\n\n{end}{rest.split(end)[1]}'
+        text = files.between(text, begin, end, f'\n{content}\n')
     return text
 
 

@@ -31,7 +31,7 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.variation import pushes, sensors, worlds
-from trl_suite.util import files
+from trl_suite.util import errors, files
 
 DOCS = pathlib.Path(__file__).resolve().parent
 SOURCES = 'trl_suite', 'trained', 'xml', 'mocap'  # what the pages of the site describe
@@ -452,10 +452,8 @@ def filled(path: str, tables: dict[str, str]) -> str:
     text = (DOCS / path).read_text(encoding='utf-8')
     for name, written in tables.items():
         start, end = f'<!-- {name}, written by docs/generate.py -->', f'<!-- /{name} -->'
-        (before, begun, _), (_, ended, after) = text.partition(start), text.partition(end)
-        if not (begun and ended):
-            raise ValueError(f'{path}: expected the lines {start!r} and {end!r}')
-        text = f'{before}{start}\n{written}\n{end}{after}'
+        with errors.naming(path):
+            text = files.between(text, start, end, written)
     return text
 
 

@@ -195,9 +195,8 @@ def _picture(
 
 def page(text: str) -> str:
     """Returns the page with the current results."""
-    begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     sections = filter(None, map(section, sorted(FOLDER.glob('*/'))))
-    return '\n\n'.join([text[:begin], *sections, text[end:]])
+    return files.between(text, BEGIN, END, '\n' + '\n\n'.join(sections) + '\n')
 
 
 def main() -> None:

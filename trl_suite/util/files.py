@@ -13,6 +13,7 @@ import stat
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from trl_suite.util import errors
 from trl_suite.util.libraries import optional
 
 fcntl = optional('fcntl')  # Windows has none
@@ -170,14 +171,25 @@ def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
     return path.with_name(f'.{path.stem}.{number}.{kind}{path.suffix.lower()}')
 
 
-def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
-    """Replaces the lines between two marks in a page."""
-    before, found, rest = path.read_text(encoding='utf-8').partition(begin)
+def between(page: str, begin: str, end: str, text: str) -> str:
+    """Returns a page with other lines between two marks.
+
+    Raises:
+      ValueError: the page lacks a mark.
+    """
+    before, found, rest = page.partition(begin)
     _, ended, after = rest.partition(end)
     if not (found and ended):
-        raise ValueError(f'{path}: expected the lines {begin!r} and {end!r}')
+        raise ValueError(f'expected the lines {begin!r} and {end!r}')
+    return f'{before}{begin}\n{text}\n{end}{after}'
+
+
+def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
+    """Replaces the lines between two marks in a page."""
+    with errors.naming(path):
+        new = between(path.read_text(encoding='utf-8'), begin, end, text)
     with replacing(path) as part:
-        part.write_text(f'{before}{begin}\n{text}\n{end}{after}', encoding='utf-8')
+        part.write_text(new, encoding='utf-8')
 
 
 @contextlib.contextmanager
