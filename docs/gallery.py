@@ -154,6 +154,11 @@ def record(id: str) -> dict[str, Any] | None:
     return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
 
 
+def shipped_run(found: dict[str, Any]) -> dict[str, Any]:
+    """Returns the run of a training record whose policy is shipped."""
+    return next(run for run in found['runs'] if run['seed'] == found['shipped'])
+
+
 def _digest(name: str) -> str:
     content = (resources.directory('trained') / name).read_bytes()
     return hashlib.sha256(content).hexdigest()[:16]
@@ -314,11 +319,9 @@ def curve(id: str) -> np.ndarray:
     if found is None:
         raise ValueError(f'no policy is shipped for {id!r}')
     type_ = task_type(spec)
-    gait = type_ is not None and type_.score == 'distance'
+    gait = type_.score == 'distance'
     value = 'distance' if gait else 'normalized_return'
-    unit, name = (1e6, 'million control steps')
-    if gait or 'hierarchical' in spec.tags:
-        unit, name = 1e3, f'thousand {"decisions" if gait else "plans"}'
+    unit, number = (1e6, 'million') if type_.samples == 'control steps' else (1e3, 'thousand')
     figure = Figure(figsize=(4.2, 2.4), layout='constrained')
     axis = figure.subplots()
     for run in sorted(found['runs'], key=lambda run: run['seed'] == found['shipped']):
@@ -329,7 +332,11 @@ def curve(id: str) -> np.ndarray:
             color='tab:blue' if front else '0.75', linewidth=1.5 if front else 1, marker='.',
             markersize=3,
         )  # fmt: skip
-    axis.set(xlabel=name, ylabel='distance (m)' if gait else 'return / maximum', xlim=(0, None))
+    axis.set(
+        xlabel=f'{number} {type_.samples}',
+        ylabel='distance (m)' if gait else 'return / maximum',
+        xlim=(0, None),
+    )
     axis.set_ylim(0, None if gait else 1)
     axis.grid(alpha=0.3)
     canvas = FigureCanvasAgg(figure)

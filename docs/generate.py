@@ -22,6 +22,7 @@ from typing import Any
 
 import gallery
 import papers
+from papers import table
 
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.actuation.muscles import MUSCLES
@@ -100,12 +101,6 @@ def slug(name: str) -> str:
 
 def page(title: str, *parts: str) -> str:
     return '\n\n'.join((f'# {title}', *filter(None, parts), f'<sub>{FIRST_LINES}</sub>')) + '\n'
-
-
-def table(header: Iterable[str], cells: Iterable[Iterable[object]]) -> str:
-    """A table whose cells are Markdown."""
-    rows = [tuple(row) for row in cells]
-    return describe.markdown_table(describe.Table(tuple(header), rows), plain=True)
 
 
 def picture(text: str, path: str) -> str:
@@ -198,8 +193,7 @@ def observing(spec: catalogue.EnvSpec) -> list[tuple[str, str]]:
     found = gallery.record(other) if other in catalogue.BY_ID else None
     if found is None:
         return []
-    run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
-    result = run['evaluation']
+    result = gallery.shipped_run(found)['evaluation']
     return [
         (
             'the same, but with observed terrain',
@@ -213,16 +207,12 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     found = gallery.record(spec.id)
     if found is None:
         return ''
-    run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
+    run = gallery.shipped_run(found)
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
     settings, unit = run['settings'], task_type(spec).samples
-    first, searched = settings.get('first', settings), 'cycles' in settings
+    first = settings.get('first', settings)
     begin = settings if settings.get('start') else first
-    trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
-    if searched:
-        trained = f'{samples:g} decisions, each of which simulates all base actions'
-        after = f'{taken:g} decisions'
     if taken < settings.get('cloned', 0) + settings.get('evaluate_every', 0) / 2:
         after += ', at the end of the imitation'
     seeds = len(found['runs'])
@@ -234,7 +224,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ),
         ('episodes that reached the step limit', f'{result["completion_rate"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
-        ('trained for', f'{trained}, seed {run["seed"]}'),
+        ('trained for', f'{samples / 1e6:.2g} million {unit}, seed {run["seed"]}'),
         *([('policy saved after', after)] if taken < 0.99 * samples else []),
         *([('of these with PPO', f'the last {settings["samples"] / 1e6:.2g} million')] if settings is not begin else []),
         *([('initial policy', begun(begin, unit))] if begin.get('start') else []),
@@ -487,9 +477,8 @@ def solved() -> str:
         if spec.id in papers.stored('shared'):
             scores[spec.domain].append(papers.stored('shared')[spec.id]['evaluation'][score])
         elif entry := gallery.record(spec.id):
-            run = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
             # Of several seeds: other episodes than those in which one was chosen.
-            measured = entry.get('shipped_again', run['evaluation'])
+            measured = entry.get('shipped_again', gallery.shipped_run(entry)['evaluation'])
             scores[spec.domain].append(measured[score])
     shares, metres = (
         ', '.join(

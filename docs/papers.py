@@ -93,6 +93,7 @@ def tables() -> dict[str, dict[str, str]]:
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Returns a table whose cells are Markdown."""
     found = [tuple(row) for row in rows]
     return describe.markdown_table(describe.Table(tuple(header), found), plain=True)
 
@@ -149,8 +150,7 @@ def shipped(id: str) -> dict[str, Any]:
     """Returns the evaluation of the policy that is shipped for a gait environment."""
     if id in stored('shared'):
         return stored('shared')[id]['evaluation']
-    record = stored(id)
-    return next(run['evaluation'] for run in record['runs'] if run['seed'] == record['shipped'])
+    return gallery.shipped_run(stored(id))['evaluation']
 
 
 def gaits() -> str:
