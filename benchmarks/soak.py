@@ -29,7 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from trl_suite import suite
-from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.util import files, program
 from trl_suite.vector import VectorEnvironment
 

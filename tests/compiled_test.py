@@ -29,7 +29,7 @@ from numba.core import event
 
 import trl_suite
 from trl_suite import suite
-from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.util import compiled as module
 from trl_suite.util import files, interrupts, machine_code, notices
 from trl_suite.util.compiled import (

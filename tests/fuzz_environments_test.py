@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from trl_suite import suite
 from trl_suite.environments import states
 from trl_suite.registry import catalogue
-from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.tasks.variation import pushes, sensors, worlds
 from trl_suite.vector import VectorEnvironment
 

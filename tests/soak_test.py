@@ -11,7 +11,7 @@ from helpers import FolderTest
 from programs import output
 
 from trl_suite import suite
-from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.task_type import TASK_TYPES
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'benchmarks'))
 import soak

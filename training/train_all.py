@@ -48,7 +48,7 @@ from networks import trimmed
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
-from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 

@@ -25,9 +25,8 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import DIMENSIONS, build_task
 from trl_suite.registry.catalogue import find
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.registry.task_types import TASK_TYPES, TITLES
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.task_type import TaskType
+from trl_suite.tasks.task_type import TASK_TYPES, TITLES, TaskType
 from trl_suite.util import errors
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)

@@ -13,10 +13,9 @@ from trl_suite.actuation import Actuators, realism
 from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.tasks import variation
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.task_type import Parts, TaskType
+from trl_suite.tasks.task_type import TASK_TYPES, Parts, TaskType
 from trl_suite.util import errors, notices
 from trl_suite.util.options import Config, option
 

@@ -24,7 +24,7 @@ class EnvSpec:
       actuation: one of `trl_suite.actuation.ACTUATIONS`, or 'gait'.
       terrain: a preset, or a file that `trl_suite.terrain.load` takes.
       description: one line.
-      task_type: name in `trl_suite.registry.task_types.TASK_TYPES`.
+      task_type: name in `trl_suite.tasks.task_type.TASK_TYPES`.
       clip: name of a clip or library of steps in mocap/, or a file; None if the task type has no
         reference motion.
       options: options of the task type that differ from its defaults.

@@ -107,43 +107,52 @@ def _planned(name: str, with_ball: bool = False) -> TaskType:
     )
 
 
-TYPES = (
-    _tracking('imitation', False, imitation.PlanarImitation, Clip),
-    _tracking('imitation', True, imitation.SpatialImitation, Clip),
-    _tracking('footsteps', False, footsteps.PlanarFootsteps, Clip),
-    _tracking('footsteps', True, footsteps.SpatialFootsteps, FootstepLibrary),
-    _planned('goal_navigation'),
-    _planned('soccer', with_ball=True),
-    TaskType(
-        'direct_navigation', 'direct_navigation', True, direct.DirectNavigationConfig, _direct, Clip
-    ),
-    TaskType(
-        'direct_soccer',
-        'direct_soccer',
-        True,
-        direct.DirectConfig,
-        tracking(direct.DirectNavigation, with_ball=True),
-        Clip,
-    ),
-    TaskType(
-        'gait',
-        'gait',
-        False,
-        GaitConfig,
-        lambda parts, config: GaitTask(parts.character, parts.arena, config),
-        actuations=('gait',),
-        score='distance',
-        samples='cycles',
-    ),
-    *(
+TASK_TYPES: dict[str, TaskType] = {
+    type_.name: type_
+    for type_ in (
+        _tracking('imitation', False, imitation.PlanarImitation, Clip),
+        _tracking('imitation', True, imitation.SpatialImitation, Clip),
+        _tracking('footsteps', False, footsteps.PlanarFootsteps, Clip),
+        _tracking('footsteps', True, footsteps.SpatialFootsteps, FootstepLibrary),
+        _planned('goal_navigation'),
+        _planned('soccer', with_ball=True),
         TaskType(
-            f'{"spatial" if spatial else "planar"}_walk',
-            'walk',
-            spatial,
-            config,
-            _walk,
-            options=(('rewards', walk.WALK),),
-        )
-        for spatial, config in walk.Walk.CONFIG.items()
-    ),
-)
+            'direct_navigation',
+            'direct_navigation',
+            True,
+            direct.DirectNavigationConfig,
+            _direct,
+            Clip,
+        ),
+        TaskType(
+            'direct_soccer',
+            'direct_soccer',
+            True,
+            direct.DirectConfig,
+            tracking(direct.DirectNavigation, with_ball=True),
+            Clip,
+        ),
+        TaskType(
+            'gait',
+            'gait',
+            False,
+            GaitConfig,
+            lambda parts, config: GaitTask(parts.character, parts.arena, config),
+            actuations=('gait',),
+            score='distance',
+            samples='cycles',
+        ),
+        *(
+            TaskType(
+                f'{"spatial" if spatial else "planar"}_walk',
+                'walk',
+                spatial,
+                config,
+                _walk,
+                options=(('rewards', walk.WALK),),
+            )
+            for spatial, config in walk.Walk.CONFIG.items()
+        ),
+    )
+}
+TITLES: tuple[str, ...] = tuple(dict.fromkeys(type_.title for type_ in TASK_TYPES.values()))
