@@ -19,8 +19,8 @@ from typing import Any
 from trl_suite.actuation import Actuators
 from trl_suite.characters import Character
 from trl_suite.tasks.component import Component
-from trl_suite.tasks.variation import additions
 from trl_suite.tasks.variation import levels as level
+from trl_suite.tasks.variation.additions import Additions
 from trl_suite.tasks.variation.motors import Motors
 from trl_suite.tasks.variation.pushes import Pushes
 from trl_suite.tasks.variation.sensors import SensorConfig, Sensors
@@ -78,9 +78,9 @@ def components(options: CommonOptions, character: Character) -> Iterator[Compone
         yield level.Levels(options.levels)
     if options.actuators.changed:
         yield Motors(options.actuators, character)
-    added = {name: getattr(options, name) for name in additions.OPTIONS}
-    if any(added.values()):
-        yield additions.additions({name: each for name, each in added.items() if each})
+    added = options.rewards, options.observations, options.failures
+    if any(added):
+        yield Additions(*(each or {} for each in added))
     if options.randomize is not None:
         yield Worlds(options.randomize)
         if options.randomize.push is not None:

@@ -14,21 +14,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.bodies.blocks import Block
+from trl_suite.bodies.blocks import Block, by_name
 from trl_suite.engine import World
 from trl_suite.tasks.component import Component
 from trl_suite.tasks.rewards import Outcome, outcome
-from trl_suite.util import errors
 
 if TYPE_CHECKING:
     from trl_suite.tasks.task import Task
 
 Function = Callable[[Any], np.ndarray]
-OPTIONS = ('rewards', 'observations', 'failures')
 
 
 class Additions(Component):
@@ -45,10 +43,9 @@ class Additions(Component):
 
     def __init__(
         self,
-        *,
-        rewards: Mapping[str, tuple[float, Function]] | None = None,
-        observations: Mapping[str, tuple[int, Function]] | None = None,
-        failures: Mapping[str, Function] | None = None,
+        rewards: Mapping[str, tuple[float, Function]],
+        observations: Mapping[str, tuple[int, Function]],
+        failures: Mapping[str, Function],
     ) -> None:
         """Keeps the functions.
 
@@ -61,11 +58,22 @@ class Additions(Component):
             discount 0.
 
         Raises:
-          ValueError: a name that is in use, an invalid weight or size, or an object that is not a
-            function.
+          ValueError: an argument that is not a dict, an invalid weight or size, or an object that is
+            not a function.
         """
-        self._rewards, self._extras = dict(rewards or {}), dict(observations or {})
-        self._failures = dict(failures or {})
+        for kind, first, entries in (
+            ('rewards', 'weight', rewards), ('observations', 'size', observations), ('failures', '', failures),
+        ):  # fmt: skip
+            if not isinstance(entries, Mapping):
+                raise ValueError(f'{kind} is {entries!r}; expected a dict of name -> part')
+            for name, entry in entries.items():
+                if first and not (isinstance(entry, tuple) and len(entry) == 2):
+                    raise ValueError(f'{kind}[{name!r}] is {entry!r}; expected ({first}, function)')
+        self._rewards, self._extras, self._failures = (
+            dict(rewards),
+            dict(observations),
+            dict(failures),
+        )
         for name, (weight, function) in self._rewards.items():
             _check('reward', name, function, np.isfinite(weight), f'weight {weight!r}')
         for name, (size, function) in self._extras.items():
@@ -95,7 +103,7 @@ class Additions(Component):
         self._outcome = outcome(n, self._own + size, terms + len(self._rewards))
         self._terms = self._outcome.reward_terms[:, terms:]
         self.action = task.action = np.zeros((n, len(task.action_map)))
-        self.saved = (_Saved(self.action), self._outcome)
+        self.saved = (by_name('Saved', {'action': self.action}), self._outcome)
         self.info_arrays = {'reward_terms': dict(zip(self._rewards, self._terms.T, strict=True))}
         if self.blocks:
             task.mirror = None  # unknown for the added blocks
@@ -150,29 +158,6 @@ class Additions(Component):
                 raise ValueError(f'{kind} {name!r} is not finite: {value[~finite][0]}')
             value = np.where(finite[:, None], value, 0.0)
         return value
-
-
-class _Saved(NamedTuple):
-    """Last action, (n, k)."""
-
-    action: np.ndarray
-
-
-def additions(parts: Mapping[str, Any]) -> Additions:
-    """Returns the component with these keyword arguments.
-
-    Raises:
-      ValueError: an unknown keyword, a value that is not a dict by name, or see `Additions`.
-    """
-    for kind, entries in parts.items():
-        errors.check_known('kind of parts', OPTIONS, kind)
-        if not isinstance(entries, Mapping):
-            raise ValueError(f'{kind} is {entries!r}; expected a dict of name -> part')
-        for name, entry in entries.items():
-            if kind != 'failures' and not (isinstance(entry, tuple) and len(entry) == 2):
-                first = 'weight' if kind == 'rewards' else 'size'
-                raise ValueError(f'{kind}[{name!r}] is {entry!r}; expected ({first}, function)')
-    return Additions(**parts)
 
 
 def _check(kind: str, name: str, function: Any, good: Any, number: str) -> None:
