@@ -43,7 +43,7 @@ BALL_LASTS = (100.0, 200.0)  # s until it is placed again
 AT_GOAL, NEAR_BALL = 0.5, 2.0  # m; distances of the ball from goal and walker for full reward
 SPEED = 1.0  # m/s; target speed of walker and ball
 SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
-_SPEEDS = f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2)'
+SPEED_REWARD = f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2)'
 
 
 def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
@@ -53,7 +53,7 @@ def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
         for name, weight, meaning in (
             (
                 'approach', 0.2 / 1.2,
-                f'{_SPEEDS}, v: speed of the centre of mass towards the place of the ball at the end of the step, m/s',
+                f'{SPEED_REWARD}, v: speed of the centre of mass towards the place of the ball at the end of the step, m/s',
             ),
             (
                 'near', 0.2 / 1.2,
@@ -62,7 +62,7 @@ def soccer_terms(share: float = 1.0) -> tuple[Term, ...]:
             ),
             (
                 'dribble', 0.4 / 1.2,
-                f'{_SPEEDS}, v: speed of the ball towards the goal, m/s; 0 unless v > 0',
+                f'{SPEED_REWARD}, v: speed of the ball towards the goal, m/s; 0 unless v > 0',
             ),
             (
                 'goal', 0.4 / 1.2,
@@ -228,17 +228,22 @@ def dribble(
     if arrived and gap < NEAR_BALL * NEAR_BALL:
         approach = near = dribbling = at_goal = 1.0
     else:
-        lack = min(towards_ball - data.target_speed, 0.0)
-        approach = math.exp(-SPEED_SHARPNESS * (lack * lack))
+        approach = speed_reward(towards_ball, data.target_speed)
         near = math.exp(-BALL_SHARPNESS * gap)
-        lack = min(towards_goal - data.target_speed, 0.0)
-        dribbling = math.exp(-SPEED_SHARPNESS * (lack * lack)) if towards_goal > 0.0 else 0.0
+        dribbling = speed_reward(towards_goal, data.target_speed) if towards_goal > 0.0 else 0.0
         at_goal = math.exp(-GOAL_SHARPNESS * left)
     give(i, approach, terms.approach, outcome)
     give(i, near, terms.near, outcome)
     give(i, dribbling, terms.dribble, outcome)
     give(i, at_goal, terms.goal, outcome)
     return towards_goal
+
+
+@compiled_inline
+def speed_reward(speed: float, target: float) -> float:
+    """Returns `SPEED_REWARD`."""
+    lack = min(speed - target, 0.0)
+    return math.exp(-SPEED_SHARPNESS * (lack * lack))
 
 
 @compiled_inline

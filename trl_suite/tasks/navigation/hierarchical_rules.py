@@ -14,9 +14,11 @@ from trl_suite.bodies.spatial import has_diverged, measure, observe_body
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.tasks.common.footstep_plan import FootstepPlan, observe_plan, update_stance
 from trl_suite.tasks.common.goals import (
+    SPEED_REWARD,
     GoalData,
     dribble,
     observe_goal,
+    speed_reward,
     store_start,
     store_trace,
     test_goal,
@@ -25,14 +27,12 @@ from trl_suite.tasks.rewards import FALL_THRESHOLD, Outcome, Term, conclude, giv
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util.compiled import compiled
 
-SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # constant reward of a step without a fall
 NAVIGATION_TERMS = (
     Term(
         'speed',
         1 - UPRIGHT,
-        f'exp(-{SPEED_SHARPNESS:g} min(0, v - target speed)^2), v: speed of the centre of mass towards the '
-        'goal, m/s',
+        f'{SPEED_REWARD}, v: speed of the centre of mass towards the goal, m/s',
     ),
     Term('upright', UPRIGHT, '1'),
 )
@@ -188,9 +188,8 @@ def score_step(i: int, data: PlanningData) -> bool:
         moved_x = measurement.com[i, 0] - begin[i, 0]
         moved_y = measurement.com[i, 1] - begin[i, 1]
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
-        lack = min(speed - aims.target_speed, 0.0)
-        full = distance < aims.near
-        worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
+        near = distance < aims.near
+        worth = 1.0 if near else speed_reward(speed, aims.target_speed)
         give(i, worth, data.terms.speed, outcome)
         give(i, 1.0, data.terms.upright, outcome)
         aims.goals.speed[i] = speed
