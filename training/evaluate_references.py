@@ -23,8 +23,8 @@ from trl_suite.util.program import begin_script
 
 def flat_ground(spec: catalogue.EnvSpec) -> str:
     """Returns the id of the environment with the same observation on flat ground."""
-    figure = '_'.join(spec.id.split('_')[:2])
-    return f'{figure}_Flat_Terrain-v0' if 'blind' not in spec.tags else f'{figure}_Flat-v0'
+    body = '_'.join(spec.id.split('_')[:2])  # actuation and character
+    return f'{body}_Flat_Terrain-v0' if 'blind' not in spec.tags else f'{body}_Flat-v0'
 
 
 def of_default_gait(id_: str) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def add_threads(command: argparse.ArgumentParser) -> None:
 
 
 def add_file(command: argparse.ArgumentParser, name: str, text: str, *suffixes: str) -> None:
-    """Adds a file to write, which is checked before the command runs, if suffixes are given."""
+    """Adds a file, whose path is checked before the command runs, if suffixes are given."""
     kind = valid(lambda path: files.check_path(path, suffixes)) if suffixes else pathlib.Path
     command.add_argument(name, type=kind, metavar='FILE', help=text)
 

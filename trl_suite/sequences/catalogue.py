@@ -41,13 +41,13 @@ _FAMILIES = (
 )
 
 SEQUENCES: dict[str, Sequence] = {
-    f'{family}_{figure}': Sequence(
-        f'{family}_{figure}',
-        tuple(id.format(f'{figure.capitalize()}2D', terrain) for terrain in terrains),
-        f'The {figure} {words} {", ".join(terrains).lower()}.',
+    f'{family}_{character}': Sequence(
+        f'{family}_{character}',
+        tuple(id.format(f'{character.capitalize()}2D', terrain) for terrain in terrains),
+        f'The {character} {words} {", ".join(terrains).lower()}.',
     )
     for family, id, terrains, words in _FAMILIES
-    for figure in ('biped', 'dog', 'raptor')
+    for character in ('biped', 'dog', 'raptor')
 }
 
 BENCHMARK = Benchmark(

@@ -1,1 +1,1 @@
-"""Components that several tasks share."""
+"""Parts that several tasks share."""

@@ -212,7 +212,7 @@ class DirectNavigation(GoalTask, TrackingTask):
     The reward is that of imitation, with the clip's velocity rotated towards the goal, and
     additional terms for heading towards the goal and for proximity (`direct_terms`). With a
     ball, half of the reward has these terms, with the ball as the goal, and half is for dribbling
-    (`ball.soccer_terms`).
+    (`goals.soccer_terms`).
     """
 
     CONFIG: Any = DirectConfig
