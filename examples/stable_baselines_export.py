@@ -38,23 +38,16 @@ def exported(model, environment):
     ]  # fmt: skip
     weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
     biases = [layer.bias.detach().numpy().copy() for layer in layers]
-    k, a = len(weights[0]), len(biases[-1])
-    options = {'mean': np.zeros(k), 'std': np.ones(k), 'clip': 1e6}
+    options = {}
     scales = model.get_vec_normalize_env()
     if scales is not None and scales.norm_obs:
         std = np.sqrt(scales.obs_rms.var + scales.epsilon)
         options = {'mean': scales.obs_rms.mean, 'std': std, 'clip': scales.clip_obs}
     if squashed:
         weights[-1], biases[-1] = np.pad(weights[-1], ((0, 0), (1, 0))), np.pad(biases[-1], (1, 0))
-        options |= {'choices': np.zeros((1, a)), 'largest_change': np.float32(1)}
-    return policies.Policy(
-        id=environment.spec.id,
-        blocks=tuple((name, part.stop - part.start) for name, part in environment.blocks.items()),
-        actions=environment.action_map.names,
-        quantity=environment.action_map.quantity,
-        weights=tuple(weights),
-        biases=tuple(biases),
-        activation='relu' if squashed else 'tanh',
-        log_std=np.zeros(a),
-        **options,
+        size = len(environment.action_map)
+        options |= {'choices': np.zeros((1, size)), 'largest_change': np.float32(1)}
+    activation = 'relu' if squashed else 'tanh'
+    return policies.Policy.for_environment(
+        environment, weights, biases, activation=activation, **options
     )

@@ -632,10 +632,10 @@ class Learner:
             line=self.line, strides=strides, origin=self.origin,
             **networks.arrays(network.filters, (2, 1, 0)),
         )  # fmt: skip
-        return policies.Policy(
-            **networks.described(self.environments, self.seed, self.samples), mean=self.mean,
-            std=self.std, clip=CLIP, columns=self.columns, convolution=convolution, **layers,
-            activation='relu', layer_norm=True, choices=self.choices,
+        return policies.Policy.for_environment(
+            self.environments, info=networks.described(self.environments, self.seed, self.samples),
+            mean=self.mean, std=self.std, clip=CLIP, columns=self.columns, convolution=convolution,
+            **layers, activation='relu', layer_norm=True, choices=self.choices,
             log_std=np.full(self.choices.shape[1], np.log(networks.LEAST_STD)),
         )  # fmt: skip
 

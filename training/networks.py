@@ -170,15 +170,9 @@ def map_shape(blocks: Blocks, view: tuple[float, float] | None) -> tuple[int, in
 
 
 def described(environments: Any, seed: int, samples: int) -> dict[str, Any]:
-    """Returns what a policy file says of its environment and its training."""
-    action_map = environments.action_map
-    info = {'seed': seed, 'samples': samples, **machine.made_with()}
-    info['character'] = environments.task.character.spec.digest
-    return {
-        'id': environments.spec.id,
-        'blocks': tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
-        'actions': tuple(action_map.names), 'quantity': action_map.quantity, 'info': info,
-    }  # fmt: skip
+    """Returns what a policy file says of its training."""
+    character = environments.task.character.spec.digest
+    return {'seed': seed, 'samples': samples, **machine.made_with(), 'character': character}
 
 
 def arrays(layers: Iterable[Any], axes: tuple[int, ...]) -> dict[str, tuple[np.ndarray, ...]]:
@@ -190,7 +184,9 @@ def arrays(layers: Iterable[Any], axes: tuple[int, ...]) -> dict[str, tuple[np.n
     }
 
 
-def exported(network_: nn.Sequential, scales: Scales, **fields: Any) -> policies.Policy:
+def exported(
+    environments: Any, network_: nn.Sequential, scales: Scales, **fields: Any
+) -> policies.Policy:
     """Returns a network with the scales of its inputs as a policy with further fields."""
     # The weights of inputs that were always 0 in training are still random: on a slope, where
     # such inputs are not 0, a policy that was trained on level ground would be disturbed.
@@ -206,9 +202,9 @@ def exported(network_: nn.Sequential, scales: Scales, **fields: Any) -> policies
         gain = np.concatenate([np.ones(maps.outputs), gain[maps.line :]])
     layers = arrays(linear(network_), (1, 0))
     layers['weights'][0][:] *= gain[:, None]
-    return policies.Policy(
-        mean=scales.mean[scales.kept], std=scales.std[scales.kept], columns=scales.columns,
-        clip=OBSERVATION_CLIP, convolution=convolution, **layers, **fields,
+    return policies.Policy.for_environment(
+        environments, mean=scales.mean[scales.kept], std=scales.std[scales.kept],
+        columns=scales.columns, clip=OBSERVATION_CLIP, convolution=convolution, **layers, **fields,
     )  # fmt: skip
 
 

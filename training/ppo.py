@@ -374,11 +374,11 @@ class Trainer:
         """Returns the current policy without PyTorch."""
         averaged = self.average is not None and self.average.n_averaged > 0
         return networks.exported(
-            self.average.module if averaged else self.policy, self.scales, places=self.places,
-            activation=self.settings.activation, log_std=self.log_std.detach().numpy().copy(),
-            mirror=self.mirror,
-            # The simulations may be of several environments.
-            **{**networks.described(self.environments, self.seed, self.samples), 'id': self.spec.id},
+            self.environments, self.average.module if averaged else self.policy, self.scales,
+            id=self.spec.id,  # the simulations may be of several environments
+            info=networks.described(self.environments, self.seed, self.samples),
+            places=self.places, activation=self.settings.activation,
+            log_std=self.log_std.detach().numpy().copy(), mirror=self.mirror,
         )  # fmt: skip
 
     def evaluate(self, folder: pathlib.Path, divergence: float) -> None:

@@ -167,6 +167,34 @@ class Policy:
         if self.mirror is not None:
             self.mirror.check(k, a)
 
+    @classmethod
+    def for_environment(
+        cls,
+        environment: Any,
+        weights: Sequence[np.ndarray],
+        biases: Sequence[np.ndarray],
+        **fields: Any,
+    ) -> Policy:
+        """Makes a policy with the observations and actions of an environment.
+
+        Args:
+          environment: a `VectorEnvironment`.
+          weights: those of the layers, as the attribute.
+          biases: those of the layers.
+          fields: further attributes; by default inputs are not scaled, and `activation` is 'tanh'.
+
+        Raises:
+          ValueError: as the class.
+        """
+        blocks = tuple((name, part.stop - part.start) for name, part in environment.blocks.items())
+        size, actions = sum(count for _, count in blocks), environment.action_map
+        return cls(**{
+            'id': environment.spec.id, 'blocks': blocks, 'actions': tuple(actions.names),
+            'quantity': actions.quantity, 'mean': np.zeros(size), 'std': np.ones(size), 'clip': 1e6,
+            'weights': tuple(weights), 'biases': tuple(biases), 'activation': 'tanh',
+            'log_std': np.zeros(len(actions)), **fields,
+        })  # fmt: skip
+
     @functools.cached_property
     def networks(self) -> tuple[_Network, ...]:
         """Convolution (or None), weights and biases of each network: of all of an ensemble, or of one."""
