@@ -87,7 +87,7 @@ class VerifyTest(FolderTest):
         return self.benchmark.verify(self.path, 1)
 
     def test_entries(self):
-        self.assertEqual(self.verify(), self.result)
+        self.assertEqual(self.verify(), (self.result, 0))
         scores = self.result['scores']
         self.write(scores=[scores[0], [np.nextafter(scores[1][0], 0)]])
         assert_refused(self, (self.verify, r'scores\[-1\] is .*; measured'))
@@ -103,7 +103,7 @@ class VerifyTest(FolderTest):
         assert_refused(self, (self.verify, r'scores\[-1\] is \[0.*\]; measured \[0'))
         # Made on another class of processor, it is within the tolerance.
         self.write(policy=running._sha256(self.stored), cpu='other')
-        self.verify()
+        self.assertEqual(self.verify()[1], running.TOLERANCE)
 
     def test_a_policy_of_another_environment_or_none(self):
         policies.save(policies.reference('PD_Dog2D_Gaps_Terrain-v0'), self.stored)
@@ -154,6 +154,7 @@ class ReportTest(parameterized.TestCase):
         found = report.report(self.results())
         a, b = found['learners']['m:A'], found['learners']['m:B']
         self.assertEqual(found['environments'], self.IDS)
+        self.assertEqual(found['left_out'], [[*benchmark.CORE][3]])
         self.assertEqual(found['samples'], [10 * (part + 1) for part in range(20)])
         self.assertAlmostEqual(a['iqm'][0], (0.3 + 0.4 + 0.5 + 0.6) / 4)
         self.assertAlmostEqual(a['median'][0], (1.0 / 4 + 3.3 / 4) / 2)
@@ -171,6 +172,7 @@ class ReportTest(parameterized.TestCase):
         text = report.table(found)
         self.assertIn('| m:A | 4 | 0.450 (', text)
         self.assertIn('2 of 12 environments, 200 samples', text)
+        self.assertIn(f'left out, since some learners lack them: {[*benchmark.CORE][3]}', text)
 
     def test_intervals_cover_the_mean(self):
         """Of 200 samples of 5 runs, about 5 % do not; the bootstrap of few runs is a bit narrow."""
@@ -187,8 +189,10 @@ class ReportTest(parameterized.TestCase):
         first = result_of('m:A', self.IDS[0], 0, 0.5)
         for others, message in (
             ([first], 'two results of m:A in PD_Biped2D.* with seed 0'),
-            ([{**first, 'seed': 1, 'budget': 300}], r'the budget \[200, 300\]; expected one'),
-            ([{**first, 'seed': 1, 'episodes': 3}], r'the episodes \[3, 32\]; expected one'),
+            ([{**first, 'seed': 1, 'budget': 300}],
+             'budget: 200 .m:A in PD_Biped2D.* with seed 0., 300 .*; expected the same in all results'),
+            ([{**first, 'seed': 1, 'episodes': 3}],
+             'episodes: 3 .*, 32 .*; expected the same in all results'),
             ([result_of('m:B', self.IDS[1], 0, 1)], 'no environment is common to the learners m:A, m:B'),
             ([result_of('m:A', self.IDS[1], 1, 1)], 'm:A: no seed is common to PD_Biped2D'),
         ):  # fmt: skip
@@ -198,7 +202,7 @@ class ReportTest(parameterized.TestCase):
 
 class ReportCommandTest(CommandTest):
     def test_results_of_a_folder(self):
-        learner = type('Nothing', (Shipped,), {'policy': lambda self: 0})
+        learner = type('Nothing', (Shipped,), {'policy': lambda self: np.zeros_like})
         folder = pathlib.Path('Nothing')
         for each in (folder, pathlib.Path('empty')):
             each.mkdir()
@@ -207,13 +211,21 @@ class ReportCommandTest(CommandTest):
         with mock.patch.object(evaluation, 'evaluate_all', scores):
             benchmark.run(ID, learner(benchmark.get(ID), 0), 60, folder / 'a.json')
         out = self.output('benchmark', 'report', 'Nothing', '--json', 'report.json')
-        self.assertRegex(out, r'Nothing \| 1 \| 0\.500 \(0\.500 to 0\.500\) \|')
+        self.assertRegex(out, r'Nothing \| 1 \| 0\.500 \| 0\.500 \|')
         found = json.loads(pathlib.Path('report.json').read_text())
         self.assertEqual(found['environments'], [ID])
-        self.assert_refused('there is no such file', 'benchmark', 'verify', 'Nothing')
+        self.assert_refused('a.json: has no policy', 'benchmark', 'verify', 'Nothing')
+        self.assert_refused(
+            'Nothin: there is no such file; did you mean', 'benchmark', 'check', 'Nothin'
+        )
         self.assert_refused('empty: has no results', 'benchmark', 'report', 'empty')
         self.assert_refused(
-            "unknown environment 'PD_Gap'", 'benchmark', 'run', 'PD_Gap', '--learner', 'a:B'
+            "unknown environment of the benchmark 'PD_Gap'",
+            'benchmark',
+            'run',
+            'PD_Gap',
+            '--learner',
+            'a:B',
         )
 
 

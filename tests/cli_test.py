@@ -21,6 +21,7 @@ from absl.testing import parameterized
 from helpers import KINDS, besides_notices
 from programs import GAPS, CommandTest, policy_for, run
 
+import trl_suite
 from trl_suite import evaluation, policies, rendering, suite
 from trl_suite.cli import list as listing
 from trl_suite.cli import rollout
@@ -411,7 +412,7 @@ class TrainedTest(CommandTest):
             f'{expected["normalized_return"]:.1%} of the maximum 256', 'episodes 5, seed 3',
             f'length {expected["length"]:.1f} of 256 steps', f'median {expected["median_distance"]:.2f} m',
             f'full length {expected["completion_rate"]:.0%} of', f'falls {expected["falls"]:.0%} of',
-            f'made with MuJoCo {expected["mujoco"]} on {expected["cpu"]}',
+            f'made with trl_suite {trl_suite.__version__}, MuJoCo {expected["mujoco"]} on {expected["cpu"]}',
         ):  # fmt: skip
             self.assertIn(fact, ' '.join(out.split()))
 

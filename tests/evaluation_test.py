@@ -187,5 +187,9 @@ class EvaluateTest(parameterized.TestCase):
             (r'actions have shape \(2, 3\)', GAPS, lambda o: np.zeros((len(o), 3)), 2),
         ):
             assert_refused(self, (functools.partial(evaluation.evaluate, *arguments), message))
+        with self.assertRaisesRegex(
+            TypeError, 'policy is None; expected a function of observations'
+        ):
+            evaluation.evaluate(GAPS, None, 1)
         with self.assertRaisesRegex(ValueError, 'torque control cannot follow a clip'):
             evaluation.evaluate('imitation/torque_dog', evaluation.clip, 1, factory=True)

@@ -393,6 +393,8 @@ class VectorTest(Same, parameterized.TestCase):
             self,
             *((lambda s=s: envs.reset(seed=s), 'seed') for s in ([1], [1, None], [-1, 2], [0.5, 1.5], -1)),
             *((lambda m=m: envs.reset(options={'reset_mask': m}), 'reset_mask') for m in masks),
+            (lambda: envs.reset(options={'levl': 3}), "unknown option of reset 'levl'; did you mean 'level'"),
+            (lambda: SuiteEnv(FLAT).reset(options={'reset_mask': 1}), "unknown option of reset 'reset_mask'"),
         )  # fmt: skip
         envs.reset(seed=1)
         with self.assertRaises(ValueError):

@@ -15,7 +15,7 @@ import pytest
 import torch
 from absl.testing import absltest, parameterized
 from helpers import FolderTest, assert_refused
-from programs import CommandTest
+from programs import CommandTest, run
 
 from trl_suite import benchmark, evaluation, sequences, suite
 from trl_suite.runs import results, running
@@ -58,7 +58,7 @@ class CatalogueTest(parameterized.TestCase):
         assert_refused(
             self,
             (lambda: sequences.get('plaid_bog'), "'plaid_bog'; did you mean 'plaid_dog'"),
-            (lambda: benchmark.get(ID[:-1]), f"unknown environment '{ID[:-1]}'.*did you mean"),
+            (lambda: benchmark.get(ID[:-1]), f"of the benchmark '{ID[:-1]}'.*did you mean"),
             (mine('PD_Bog2D_Gaps_Terrain-v0'), "unknown environment 'PD_Bog2D_Gaps_Terrain-v0'"),
             (mine('plaid/dog_flat', 'PD_Dog2D_Flat_Terrain-v0'), 'each once'),
         )
@@ -188,7 +188,10 @@ class StageTest(absltest.TestCase):
             self,
             (lambda: environments.seed([1, 2, 2**31]), for_tests),
             (lambda: environments.seed(sequences.test_seeds(3)), for_tests),
+            (lambda: environments.reset(seed=2**31), for_tests),
             (lambda: environments.seed(None), 'seed is None'),
+            (lambda: environments.seed(1.5), 'seed is 1.5; expected a whole number'),
+            (lambda: environments.seed(-1), 'seed is -1; expected a whole number at least 0'),
             (lambda: make(3, seed=1), 'seed: expected none'),
             (lambda: make(3, 'plaid/dog_walls'), "of the run 'PD_Dog2D_Walls_Terrain-v0'"),
         )
@@ -318,7 +321,7 @@ class RunTest(RunCase):
         self.assertEqual((part['mujoco'], part['cpu']), ('3.17.0', 'x86_64 AVX2'))
         with (
             made('3.18.0', 'x86_64 AVX2'),
-            self.assertRaisesRegex(ValueError, 'with another mujoco: 3.17.0; expected 3.18.0'),
+            self.assertRaisesRegex(ValueError, 'another run: mujoco is 3.17.0; expected 3.18.0'),
         ):
             self.run_short(Keeper())
         for cpu in ('x86_64 AVX-512', 'x86_64 AVX2'):
@@ -409,8 +412,8 @@ class RunTest(RunCase):
         assert_refused(
             self,
             (run(Counter()), '1 of 3 stages, and a Counter cannot resume'),
-            (run(Counter(), budget=8), 'another budget: 7; expected 8'),
-            (run(Keeper()), 'another learner: .*Counter; expected .*Keeper'),
+            (run(Counter(), budget=8), 'another run: budget is 7; expected 8'),
+            (run(Keeper()), 'another run: learner is .*Counter; expected .*Keeper'),
             (run(Counter(), budget=0), 'budget is 0'),
             (run(Counter(), stages=4), 'stages is 4; expected a whole number from 1 to 3'),
             (run(Counter(), path=self.folder / 'result.txt'), "'.txt'"),
@@ -466,7 +469,7 @@ class ResultTest(RunCase):
         ('format', 'trl_suite benchmark 0',
          "format is 'trl_suite benchmark 0'; expected 'trl_suite benchmark 1'", BENCHMARK),
         ('environment', 'PD_Dog2D_Flat_Terrain-v0',
-         "unknown environment of the core set 'PD_Dog2D_Flat", BENCHMARK),
+         "unknown environment of the benchmark 'PD_Dog2D_Flat", BENCHMARK),
         ('ids', ['PD_Dog2D_Mixed_Terrain-v0'], r"ids is \['PD_Dog2D.*expected \['PD_Biped2D_Gaps", BENCHMARK),
         ('samples[19]', [106], r'samples\[19\] is \[106\], in total 106; .* at most 105', BENCHMARK),
         ('scores', [[0.5]] * 21, 'scores: 21 stages; expected 20', BENCHMARK),
@@ -560,9 +563,12 @@ class LearnerTest(CommandTest):
          rf'^Nothing/{ID}_s0.json: score 0\.\d\d\d\n$'),
     )  # fmt: skip
     def test_run_and_check(self, command, name, budget, path, of, samples, taken, out):
-        run = (command, 'run', name, '--budget', budget, '--episodes', '1', '--threads', '1',
-               '--learner')  # fmt: skip
-        self.assertRegex(self.output(*run, 'my_learner:Nothing'), out)
+        arguments = (command, 'run', name, '--budget', budget, '--episodes', '1', '--threads', '1',
+                     '--learner')  # fmt: skip
+        status, printed, warned = run(*arguments, 'my_learner:Nothing')
+        self.assertEqual(status, 0)
+        self.assertRegex(printed, out)
+        self.assertStartsWith(warned, f'trl-suite: not comparable: budget is {budget}, not ')
         result = of.read(path)
         self.assertEqual((result['budget'], result['learner']), (int(budget), 'my_learner:Nothing'))
         self.assertEqual(np.sum(result['samples']), samples)
@@ -584,9 +590,9 @@ class LearnerTest(CommandTest):
             'edited.json: digest is .*the file was', command, 'check', 'edited.json'
         )
         pathlib.Path(path).unlink()
-        self.assert_refused(
-            rf'stage 0 \(.*2 more samples; .* at most .*{taken} are', *run, 'my_learner:Greedy'
-        )
+        status, _, err = run(*arguments, 'my_learner:Greedy')
+        self.assertEqual(status, 2)
+        self.assertRegex(err, rf'stage 0 \(.*2 more samples; .* at most .*{taken} are')
 
     def test_list(self):
         out = self.output('sequences', 'list')
@@ -604,7 +610,10 @@ class LearnerTest(CommandTest):
               for name in ('my_learner', '.a:C', 'a..b:C', 'a b:C')),
             *((f"--learner is '{name}', which has no train and policy; expected a class", name)
               for name in ('os:path', 'pathlib:Path')),
-            ("--budget is 'tiny'; expected .* or a number", 'my_learner:Nothing', '--budget', 'tiny'),
+            *((f"--budget is '{budget}'; expected .* or a number", 'my_learner:Nothing', '--budget', budget)
+              for budget in ('tiny', '20000.7', 'inf')),
+            ('--seed is -1; expected a whole number at least 0', 'my_learner:Nothing', '--seed', '-1'),
+            ("--learner is 'my_learner_:A'; expected a module of this folder", 'my_learner_:A'),
         ),
     )  # fmt: skip
     def test_bad_learners_are_refused(self, command, refused):

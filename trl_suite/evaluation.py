@@ -95,6 +95,7 @@ def evaluate(
 
     Raises:
       ValueError: unknown names or options, numbers out of range, or an incompatible `Policy`.
+      TypeError: `policy` is no function.
     """
     cases = [(environment, policy)]
     [result] = evaluate_all(
@@ -179,6 +180,8 @@ def _run(
     try:
         if step_limit is None:
             raise ValueError(f'{id_} has no step limit, so its episodes may never end')
+        if not callable(policy):
+            raise TypeError(f'policy is {policy!r}; expected a function of observations')
         if isinstance(policy, Policy):
             policy.check(environments)
         silent = None if progress else True

@@ -103,6 +103,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
 
         `options` may have the 'level' of the environment's `reset`.
         """
+        errors.check_known('option of reset', ('level',), *(options or {}))
         if seed is not None:
             arguments.check_seed('seed', seed)
             seed = int(seed)
@@ -192,6 +193,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
         They are seeded if `seed` is given. `options` may have the 'level' of the environment's `reset`.
         """
+        errors.check_known('option of reset', ('level', 'reset_mask'), *(options or {}))
         env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
         if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
             raise ValueError(

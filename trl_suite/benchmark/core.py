@@ -60,7 +60,7 @@ def normalised(id: str, score: float) -> float:
 
 
 def _custom(name: str, ids: tuple[str, ...]) -> Course:
-    raise ValueError(errors.unknown('environment of the core set', name, CORE))
+    raise ValueError(errors.unknown('environment of the benchmark', name, CORE))
 
 
 def _measured(course: Course, scores: list[list[float]], initial: list[float]) -> dict[str, float]:

@@ -33,13 +33,14 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
     Only environments count that all learners have results of, and of each learner those seeds that
     it has for all these environments. Every estimate is [value, low, high], with the bounds of its
-    95 % confidence interval.
+    95 % confidence interval, which is a point if there is one run.
 
     Args:
       results: complete results of one budget.
 
     Returns:
-      * 'budget', 'environments', and 'samples' of the points of curves, (20,).
+      * 'budget', 'environments', 'left_out', those that only some learners have, and 'samples' of the
+        points of curves, (20,).
       * 'learners': by name 'seeds'; 'scores', by environment those after each part of each run, (runs,
         20); the estimates `AGGREGATES` after the run; 'curve', the interquartile mean after each
         part, (20, 3); 'profile', the share of runs with a score above each of `LEVELS`, (25, 3).
@@ -59,10 +60,15 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
         runs[key] = result
     everything = [result for runs in found.values() for result in runs.values()]
     for name in ('budget', 'episodes'):
-        values = sorted({result[name] for result in everything})
+        values = {result[name]: result for result in everything}
         if len(values) != 1:
-            raise ValueError(f'results have the {name} {values}; expected one {name} in all')
-    ids = [id for id in CORE if all(any(key[0] == id for key in runs) for runs in found.values())]
+            each = ', '.join(
+                f'{value} ({of["learner"]} in {of["environment"]} with seed {of["seed"]})'
+                for value, of in sorted(values.items())
+            )
+            raise ValueError(f'{name}: {each}; expected the same in all results')
+    count = {id: sum(any(key[0] == id for key in runs) for runs in found.values()) for id in CORE}
+    ids = [id for id in CORE if count[id] == len(found)]
     if not ids:
         raise ValueError(f'no environment is common to the learners {", ".join(found)}')
     curves, learners = {}, {}
@@ -85,6 +91,7 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
     return {
         'budget': budget,
         'environments': ids,
+        'left_out': [id for id in CORE if 0 < count[id] < len(found)],
         'samples': [budget * (part + 1) // parts for part in range(parts)],
         'learners': learners,
         'improvement': {
@@ -135,12 +142,21 @@ def _improvement(a: np.ndarray, b: np.ndarray) -> list[float]:
 def table(found: dict[str, Any]) -> str:
     """Returns the statistics of `report` as tables in Markdown."""
     ids, learners = found['environments'], found['learners']
+    several = {learner: len(of['seeds']) > 1 for learner, of in learners.items()}
+
+    def words(values: list[float], digits: int, interval: bool) -> str:
+        value, *bounds = (f'{each:.{digits}f}' for each in values)
+        return f'{value} ({" to ".join(bounds)})' if interval else value
+
+    title = f'{len(ids)} of {len(CORE)} environments, {found["budget"]:,} samples, 95 % confidence intervals'
+    if found['left_out']:
+        title += f'; left out, since some learners lack them: {", ".join(found["left_out"])}'
     lines = [
-        f'{len(ids)} of {len(CORE)} environments, {found["budget"]:,} samples, 95 % confidence intervals', '',
+        title, '',
         f'| learner | seeds | {" | ".join(AGGREGATES)} |', '|--|--:|' + '--|' * len(AGGREGATES),
     ]  # fmt: skip
     for learner, of in sorted(learners.items(), key=lambda item: -item[1]['iqm'][0]):
-        cells = ['{:.3f} ({:.3f} to {:.3f})'.format(*of[name]) for name in AGGREGATES]
+        cells = [words(of[name], 3, several[learner]) for name in AGGREGATES]
         lines.append(f'| {learner} | {len(of["seeds"])} | {" | ".join(cells)} |')
     lines += ['', f'| environment | {" | ".join(learners)} |', '|--|' + '--:|' * len(learners)]
     for id in ids:
@@ -149,5 +165,6 @@ def table(found: dict[str, Any]) -> str:
     if found['improvement']:
         lines += ['', '| A, B | probability that A is better |', '|--|--|']
     for pair, values in found['improvement'].items():
-        lines.append('| {} | {:.2f} ({:.2f} to {:.2f}) |'.format(pair, *values))
+        interval = any(several[learner] for learner in pair.split(', '))
+        lines.append(f'| {pair} | {words(values, 2, interval)} |')
     return '\n'.join(lines)

@@ -20,7 +20,9 @@ def declare(commands: Any) -> None:
     command.add_argument('--episodes', type=positive, default=100, help='number of episodes')
     command.add_argument('--seed', type=int, default=0, help='seed of the episodes')
     text = "in Minari's format, into its folder"
-    command.add_argument('--minari', action='store_true', required=True, help=text)
+    command.add_argument(
+        '--minari', action='store_true', required=True, default=argparse.SUPPRESS, help=text
+    )
     add_threads(command)
 
 

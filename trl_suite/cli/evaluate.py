@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+import trl_suite
 from trl_suite.cli import engine
 from trl_suite.cli.arguments import (
     add_command,
@@ -67,5 +68,9 @@ def run(arguments: argparse.Namespace) -> None:
   distance     {distance:.2f} m{between}, median {median_distance:.2f} m, at {speed:.2f} m/s
   full length  {completion_rate:.0%} of the episodes
   falls        {falls:.0%} of the episodes
-  made with    MuJoCo {mujoco} on {cpu}"""
-    print(text.format_map({**result, 'around': around, 'between': between}))
+  made with    trl_suite {version}, MuJoCo {mujoco} on {cpu}"""
+    print(
+        text.format_map(
+            {**result, 'around': around, 'between': between, 'version': trl_suite.__version__}
+        )
+    )

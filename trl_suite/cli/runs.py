@@ -12,13 +12,14 @@ from typing import Any
 from trl_suite.cli import engine
 from trl_suite.cli.arguments import add_command, add_file, add_threads, positive
 from trl_suite.util import errors, files, program
+from trl_suite.util.options import checked
 
 
 def declare(commands: Any) -> None:
     """Declares the commands, their actions, and their arguments."""
     text = 'list the environments, with the scores that are 0 and 1'
     actions = _add(commands, 'benchmark', 'benchmark of learning algorithms', text, _list)
-    text = 'train a learner on environments of the core set, and test it after every 5 %%'
+    text = 'train a learner on environments of the core set, and test it after every 5 %'
     command = _add_run(actions, text, _run, '1M', '10M')
     text = 'environment of the core set; by default all, one after the other'
     command.add_argument('ids', nargs='*', metavar='ID', help=text)
@@ -50,8 +51,7 @@ def _add(commands: Any, name: str, text: str, listed: str, list_: Any) -> Any:
     add_command(actions, 'list', listed, list_)
     command = add_command(actions, 'check', 'check results: fields, budget and metrics', _check)
     command.set_defaults(benchmark=name)
-    text = 'a result, .json'
-    command.add_argument('files', nargs='+', type=pathlib.Path, metavar='FILE', help=text)
+    _add_results(command)
     return actions
 
 
@@ -78,7 +78,7 @@ def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
     """Returns the files of results in entries, which are files or folders."""
     paths = []
     for entry in entries:
-        found = sorted(entry.rglob('*.json')) if entry.is_dir() else [entry]
+        found = sorted(entry.rglob('*.json')) if entry.is_dir() else [files.existing(entry)]
         if not found:
             raise ValueError(f'{entry}: has no results; expected files ENVIRONMENT_sSEED.json')
         paths += found
@@ -87,21 +87,23 @@ def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
 
 def _list(arguments: argparse.Namespace) -> None:
     benchmark = engine.load('trl_suite.benchmark')
-    print(f'{"environment":<35} {"0":>7} {"1":>7} {"limit":>6}  what it tests')
+    print(f'{"environment":<36} {"0":>7} {"1":>7} {"limit":>6}  what it tests')
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
         limit = course.spec(id).step_limit
-        print(f'{id:<35} {low:>7.3f} {high:>7.3f} {limit:>6}  {course.description}')
+        print(f'{id:<36} {low:>7.3f} {high:>7.3f} {limit:>6}  {course.description}')
 
 
 def _run(arguments: argparse.Namespace) -> None:
     benchmark = engine.load('trl_suite.benchmark')
     courses = [benchmark.get(id) for id in arguments.ids or benchmark.CORE]
+    checked('--seed', arguments.seed, int, at_least=0)
     kind = _learner(arguments.learner)
     budget = _budget(arguments.budget, benchmark.BUDGETS)
     folder = arguments.output or pathlib.Path(arguments.learner.rpartition(':')[2])
     folder.mkdir(exist_ok=True)
     for course in courses:
+        _warn(benchmark.BENCHMARK, course, budget, arguments)
         path = folder / f'{course.name}_s{arguments.seed}.json'
         result = benchmark.run(
             course, kind(course, arguments.seed), budget, path, arguments.episodes,
@@ -119,11 +121,13 @@ def _list_sequences(arguments: argparse.Namespace) -> None:
 def _run_sequence(arguments: argparse.Namespace) -> None:
     sequences = engine.load('trl_suite.sequences')
     sequence = sequences.get(arguments.name)
+    checked('--seed', arguments.seed, int, at_least=0)
     kind = _learner(arguments.learner)
+    budget = _budget(arguments.budget, sequences.BUDGETS)
+    _warn(sequences.BENCHMARK, sequence, budget, arguments)
     result = sequences.run(
-        sequence, kind(sequence, arguments.seed), _budget(arguments.budget, sequences.BUDGETS),
-        arguments.output, arguments.episodes, arguments.seed, arguments.threads, progress=True,
-        stages=arguments.stages,
+        sequence, kind(sequence, arguments.seed), budget, arguments.output, arguments.episodes,
+        arguments.seed, arguments.threads, progress=True, stages=arguments.stages,
     )  # fmt: skip
     for id, row in zip(sequence.ids, result['scores'], strict=False):
         print(f'after {id:34}', *(f'{score:.3f}' for score in row))
@@ -131,10 +135,20 @@ def _run_sequence(arguments: argparse.Namespace) -> None:
         print(f'{name:40} {value:.3f}')
 
 
+def _warn(benchmark: Any, course: Any, budget: int, arguments: argparse.Namespace) -> None:
+    """Says before a run, which may take hours, that its result will not be comparable."""
+    notes = benchmark.departures({
+        benchmark.field: course.name, 'budget': budget, 'episodes': arguments.episodes,
+        'seed': arguments.seed,
+    })  # fmt: skip
+    if notes:
+        print(f'trl-suite: not comparable: {"; ".join(notes)}', file=sys.stderr, flush=True)
+
+
 def _check(arguments: argparse.Namespace) -> None:
     """Checks results, and prints one line for each."""
     benchmark = engine.load(f'trl_suite.{arguments.benchmark}').BENCHMARK
-    for path in arguments.files:
+    for path in _results(arguments.entries):
         result = benchmark.read(path)
         notes = benchmark.departures(result)
         comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
@@ -159,15 +173,22 @@ def _report(arguments: argparse.Namespace) -> None:
 def _verify(arguments: argparse.Namespace) -> None:
     benchmark = engine.load('trl_suite.benchmark')
     for path in _results(arguments.entries):
-        result = benchmark.verify(path, arguments.threads)
-        print(program.printable(f'{path}: verified, score {result["metrics"]["score"]:.3f}'))
+        result, allowed = benchmark.verify(path, arguments.threads)
+        how = 'bit for bit' if not allowed else f'within {allowed}'
+        mujoco, cpu = (result.get(name, 'unknown') for name in ('mujoco', 'cpu'))
+        score = f'score {result["metrics"]["score"]:.3f}'
+        print(
+            program.printable(
+                f'{path}: verified {how} (made with MuJoCo {mujoco} on {cpu}), {score}'
+            )
+        )
 
 
 def _budget(text: str, budgets: dict[str, int]) -> int:
     """Returns a number of samples by its name, or as it is given."""
     try:
-        return budgets[text] if text in budgets else int(float(text))
-    except (ValueError, OverflowError):
+        return budgets[text] if text in budgets else checked('budget', float(text), int)
+    except ValueError:
         raise ValueError(
             f'--budget is {text!r}; expected {", ".join(budgets)} or a number of samples'
         ) from None
@@ -179,7 +200,14 @@ def _learner(text: str) -> Any:
     if not (name and all(part.isidentifier() for part in module.split('.'))):
         raise ValueError(f'--learner is {text!r}; expected module:Class')
     sys.path.insert(0, os.getcwd())
-    found = importlib.import_module(module)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in (module, module.partition('.')[0]):
+            raise
+        raise ValueError(
+            f'--learner is {text!r}; expected a module of this folder or an installed one: {error}'
+        ) from None
     if not hasattr(found, name):
         classes = [each for each in dir(found) if isinstance(getattr(found, each), type)]
         raise ValueError(errors.unknown(f'learner of the module {module}:', name, classes))

@@ -87,7 +87,7 @@ class Format:
         Raises:
           ValueError: an unknown name; the message has the closest matches.
         """
-        errors.check_known(self.field, self.courses, name)
+        errors.check_known(f'{self.field} of the benchmark', self.courses, name)
         return self.courses[name]
 
     def course_of(self, result: dict[str, Any]) -> Course:

@@ -195,7 +195,9 @@ class Benchmark(results.Format):
         found = evaluation.evaluate_all(cases, episodes, seeds, num_threads, executor=executor)
         return [result[SCORE] for result in found]
 
-    def verify(self, path: str | os.PathLike[str], num_threads: int = 0) -> dict[str, Any]:
+    def verify(
+        self, path: str | os.PathLike[str], num_threads: int = 0
+    ) -> tuple[dict[str, Any], float]:
         """Checks a result, and repeats its last test with the policy beside it.
 
         Args:
@@ -203,19 +205,23 @@ class Benchmark(results.Format):
           num_threads: threads that step the physics; 0 uses all cores.
 
         Returns:
-          The result.
+          The result, and by how much scores were allowed to differ: 0, or `TOLERANCE` if it was made
+          with another version of MuJoCo or on another class of processor.
 
         Raises:
-          ValueError: the result or the policy is invalid, or the policy has other scores: in any
-            bit, or, with another version of MuJoCo or on another class of processor, by more than
-            `TOLERANCE`.
+          ValueError: the result or the policy is invalid, there is no policy, or its scores differ by
+            more than that.
           OSError: a file cannot be read.
         """
         result, path = self.read(path), pathlib.Path(path)
-        stored = files.existing(path.with_suffix('.npz'))
-        if result.get('policy') != (found := _sha256(stored)):
+        if 'policy' not in result:
             raise ValueError(
-                f'{path}: policy is {result.get("policy")!r}; expected {found!r}, the SHA-256 of '
+                f'{path}: has no policy; expected a run of a learner whose policy() is a policies.Policy'
+            )
+        stored = files.existing(path.with_suffix('.npz'))
+        if result['policy'] != (found := _sha256(stored)):
+            raise ValueError(
+                f'{path}: policy is {result["policy"]!r}; expected {found!r}, the SHA-256 of '
                 f'{stored.name}: one of the two was changed after the run'
             )
         course = self.course_of(result)
@@ -223,9 +229,10 @@ class Benchmark(results.Format):
             course, policies.load(stored), result['episodes'], result['seed'], num_threads
         )
         same = all(result.get(name) == value for name, value in machine.made_with().items())
-        if not np.allclose(again, result['scores'][-1], rtol=0, atol=0 if same else TOLERANCE):
+        allowed = 0.0 if same else TOLERANCE
+        if not np.allclose(again, result['scores'][-1], rtol=0, atol=allowed):
             raise ValueError(f'{path}: scores[-1] is {result["scores"][-1]}; measured {again}')
-        return result
+        return result, allowed
 
     def _resumed(
         self, path: pathlib.Path, expected: dict[str, Any], learner: Learner, stages: int
@@ -235,8 +242,7 @@ class Benchmark(results.Format):
         for name in (*self.settings, 'mujoco'):
             if result.get(name, expected[name]) != expected[name]:
                 raise ValueError(
-                    f'{path} holds a run with another {name}: {result[name]}; expected '
-                    f'{expected[name]}'
+                    f'{path} holds another run: {name} is {result[name]}; expected {expected[name]}'
                 )
         done = len(result['scores'])
         if 0 < done < stages:
@@ -245,7 +251,13 @@ class Benchmark(results.Format):
                     f'{path} holds {done} of {stages} stages, and a {type(learner).__name__} '
                     'cannot resume: it has no methods save and load; remove the file to start again'
                 )
-            learner.load(_state(path, done))
+            state = _state(path, done)
+            if not state.is_dir():
+                raise FileNotFoundError(
+                    f"{state}: there is no such folder, the learner's state after {done} stages; "
+                    f'remove {path} to start again'
+                )
+            learner.load(state)
         if done < stages and 'cpu' in result:
             cpus = [*result['cpu'].split(', '), expected['cpu']]
             result['cpu'] = ', '.join(dict.fromkeys(cpus))

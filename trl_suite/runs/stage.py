@@ -14,6 +14,7 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.runs.course import FIRST_TEST_SEED, Course, train_seeds
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 POINTS = 20  # of a learning curve
 
@@ -158,10 +159,10 @@ class _Counted(VectorEnvironment):
         """
         if seed is None:
             raise ValueError('seed is None; expected seeds, so that the run can be repeated')
-        # A NumPy integer is one seed, too.
-        seeds = seed if np.ndim(seed) else train_seeds(self.num_envs, int(np.asarray(seed)))
+        kind = Numbers[int] if np.ndim(seed) else int
+        seeds = checked('seed', seed, kind, at_least=0)
         if np.max(seeds) >= FIRST_TEST_SEED:
             raise ValueError(
                 f'seed {np.max(seeds)} is for tests; expected training seeds, below {FIRST_TEST_SEED}'
             )
-        super().seed(seeds, env_ids)
+        super().seed(seeds if np.ndim(seed) else train_seeds(self.num_envs, seeds), env_ids)
