@@ -27,7 +27,6 @@ DOCS = pathlib.Path(__file__).resolve().parent
 PAGE, FOLDER = DOCS / 'benchmark.md', DOCS / 'benchmark'
 ENTRIES = DOCS.parent / 'benchmarks' / 'entries'
 BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_learner:')
-NONE = 'No result has been stored yet.'
 
 
 def core(found: dict[str, Any]) -> str:
@@ -45,24 +44,27 @@ def core(found: dict[str, Any]) -> str:
     return '\n'.join(lines)
 
 
+def count_of(levels: str) -> str:
+    """Returns the number of levels in words."""
+    return f'{int(levels):,}' if int(levels) < 2**31 else 'no limit'
+
+
 def levels() -> str:
-    """Returns the table of scores on levels of training and on others."""
-    stored = FOLDER / 'levels.json'
-    if not stored.exists():
-        return NONE
+    """Returns the table of scores on levels of training and on others, and their picture."""
     lines = [
-        '| environment | levels | runs | on these levels | on others | gap |',
+        '| environment | levels | runs | on these levels | on others | gap, and its range over runs |',
         '|--|--:|--:|--:|--:|--:|',
     ]
-    for id, counts in files.read_json(stored).items():
+    for id, counts in files.read_json(FOLDER / 'levels.json').items():
         for count, scores in counts.items():
-            if scores:
-                own, others = np.mean(scores, 0)
-                number = f'{int(count):,}' if int(count) < 2**31 else 'no limit'
-                lines.append(
-                    f'| `{id}` | {number} | {len(scores)} | {own:.3f} | {others:.3f} | {own - others:.3f} |'
-                )
-    return '\n'.join(lines)
+            own, others = np.mean(scores, 0)
+            gaps = np.subtract(*np.transpose(scores))
+            span = f' ({min(gaps):.3f} to {max(gaps):.3f})' if len(scores) > 1 else ''
+            lines.append(
+                f'| `{id}` | {count_of(count)} | {len(scores)} | {own:.3f} | {others:.3f} | {own - others:.3f}{span} |'
+            )
+    picture = '![Mean return on the levels of training and on others](benchmark/levels.svg)'
+    return '\n'.join((*lines, '', picture))
 
 
 def entries() -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -154,6 +156,27 @@ def pictures(found: dict[str, Any], others: list[dict[str, Any]]) -> None:
             axes.set_title(id.removesuffix('-v0').replace('_Terrain', ''), fontsize=7)
         figure.legend(lines.values(), lines, loc='outside lower center', ncols=5)
         _save(figure, FOLDER / 'environments.svg')
+        of = files.read_json(FOLDER / 'levels.json')
+        figure, axes = pyplot.subplots(
+            1,
+            len(of),
+            figsize=(2.6 * len(of), 2.2),
+            squeeze=False,
+            sharey=True,
+            layout='constrained',
+        )
+        for each, (id, counts) in zip(axes[0], of.items(), strict=True):
+            for k, name in enumerate(('levels of training', 'other levels')):
+                runs = [np.transpose(scores)[k] for scores in counts.values()]
+                each.errorbar(
+                    range(len(counts)), [run.mean() for run in runs], label=name, marker='.', capsize=2,
+                    yerr=[[run.mean() - run.min() for run in runs], [run.max() - run.mean() for run in runs]],
+                )  # fmt: skip
+            each.set_xticks(range(len(counts)), [count_of(count) for count in counts])
+            each.set_title(id.removesuffix('-v0').replace('_Terrain', ''), fontsize=7)
+        axes[0, 0].set(xlabel='levels', ylabel='mean return / step limit')
+        axes[0, 0].legend(fontsize=7)
+        _save(figure, FOLDER / 'levels.svg')
 
 
 def _save(figure: Any, path: pathlib.Path) -> None:
