@@ -1,11 +1,13 @@
-"""Comparisons of trainings for the pages of the documentation: of actions, hierarchy and torque limits.
+"""Comparisons of trainings for the pages of the documentation.
 
     python training/compare.py actions --seeds 1 2 3 --json docs/data/gait_actions.json
+    python training/compare.py changes --seeds 1 2 3 --json docs/data/gait_changes.json
     python training/compare.py hierarchy --seeds 1 2 3 --json docs/data/hierarchy.json \
         --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
     python training/compare.py limits --seeds 1 2 3 --samples 1e6 --page docs/reports/robustness.md
 
 `actions`: base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
+`changes`: the selection of base actions by a shipped policy, trained on with PPO, alone and with changes.
 `hierarchy`: as Figure 9 of Peng et al. (2017), footstep planning above a trained controller, and control
 without hierarchy that starts from a walk, with the same number of control steps; no demonstrations,
 curricula or averages of weights. `limits`: actuation models of the biped, trained and evaluated with
@@ -18,6 +20,8 @@ the JSON file, and not repeated.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
 import json
 import pathlib
 from collections.abc import Callable
@@ -28,6 +32,7 @@ import learn_gaits
 import numpy as np
 import pages
 import ppo
+import refine_gaits
 import settings
 import torch
 import tqdm
@@ -84,33 +89,71 @@ def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -
     else:
         own = learn_gaits.Settings(action=action, expert_cycles=0, evaluation_episodes=0, **common)
         curve = learn_gaits.train(DOG, seed, own, folder, 1)
-    found = evaluation.evaluate(DOG, policies.load(folder / 'policy.npz'), ACTION_EPISODES, SEED, 1)
+    return measured(DOG, curve, folder)
+
+
+CHANGED = 'FSM_Dog2D_Terrain_Narrow_Gaps-v0'
+CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
+    'selection': ('selection alone', {}),
+    'all': ('the same change for all base actions', {'changes': 'all'}),
+    'each': ('a change for each base action', {'changes': 'each'}),
+    'less': ('the same for all, noise 0.02', {'changes': 'all', 'noise': 0.02}),
+    'more': ('the same for all, noise 0.1', {'changes': 'all', 'noise': 0.1}),
+}
+
+
+def train_changes(cell: str, seed: int, cycles: float, folder: pathlib.Path) -> dict[str, Any]:
+    """Trains from one network of the shipped policy; in the first quarter changes alone, if any."""
+    shipped, first, own = policies.reference(CHANGED), folder / 'first.npz', CHANGES[cell][1]
+    convolution, weights, biases = shipped.networks[0]
+    folder.mkdir(parents=True, exist_ok=True)
+    policies.save(
+        dataclasses.replace(shipped, convolution=convolution, weights=weights, biases=biases), first
+    )
+    asked = refine_gaits.settings_for(
+        CHANGED, start=str(first), samples=cycles, substeps=1, horizon=32, averaged=2e4,
+        changes_first=cycles / 4 if own else 0, evaluate_every=cycles / 8, **own,
+    )  # fmt: skip
+    return measured(CHANGED, refine_gaits.train(CHANGED, seed, asked, folder, 1), folder)
+
+
+def measured(id_: str, curve: list[dict[str, Any]], folder: pathlib.Path) -> dict[str, Any]:
+    """Returns distances and curve of a training of a gait."""
+    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), ACTION_EPISODES, SEED, 1)
     keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     points = [[point['samples'], point['distance']] for point in curve if 'distance' in point]
     return {**{key: found[key] for key in keys}, 'curve': points}
 
 
-def action_table(results: Results, seeds: list[int]) -> str:
+def distance_table(names: dict[str, str], id_: str, results: Results, seeds: list[int]) -> str:
     rows = []
-    for action, name in ACTIONS.items():
-        if done := of(results, action):
+    for cell, name in names.items():
+        if done := of(results, cell):
             distances = [f'{done[seed]["distance"]:.0f}' if seed in done else '–' for seed in seeds]
             mean, speed = (
                 np.mean([each[k] for each in done.values()]) for k in ('distance', 'speed')
             )
             rows.append([name, *distances, f'{mean:.0f}', f'{speed:.1f}'])
-    title = f'Distance to the first fall in `{DOG}`, mean of {ACTION_EPISODES} episodes, m:'
+    title = f'Distance to the first fall in `{id_}`, mean of {ACTION_EPISODES} episodes, m:'
     head = ['action', *(f'seed {seed}' for seed in seeds), 'mean', 'speed, m/s']
     return f'{title}\n\n{pages.table(head, rows)}'
 
 
-def action_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
+def distance_panels(names: dict[str, str], results: Results) -> dict[str, dict[str, list[Any]]]:
     def curve(result: dict[str, Any]) -> np.ndarray:
         last = [result['curve'][-1][0], result['distance']]  # of the final policy
         return np.array([*result['curve'], last]) * (1e-3, 1)
 
-    found = {name: list(map(curve, of(results, each).values())) for each, name in ACTIONS.items()}
+    found = {name: list(map(curve, of(results, each).values())) for each, name in names.items()}
     return {'distance to the first fall, m': found}
+
+
+def of_gaits(cycles: float, id_: str, names: dict[str, str], job: Callable[..., Any]) -> Comparison:
+    """Returns a comparison by the distance to the first fall in an environment."""
+    table, panels = (functools.partial(of, names) for of in (distance_table, distance_panels))
+    return Comparison(
+        cycles, tuple(names), job, functools.partial(table, id_), panels, 'cycles, thousand'
+    )
 
 
 # Hierarchy.
@@ -245,8 +288,9 @@ def limit_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
 
 
 COMPARISONS = {
-    'actions': Comparison(
-        32768, tuple(ACTIONS), train_actions, action_table, action_panels, 'cycles, thousand'
+    'actions': of_gaits(32768, DOG, ACTIONS, train_actions),
+    'changes': of_gaits(
+        98304, CHANGED, {cell: name for cell, (name, _) in CHANGES.items()}, train_changes
     ),
     'hierarchy': Comparison(
         1.2e6, tuple(f'{task}/{kind}' for task in TASKS for kind in KINDS), train_hierarchy,

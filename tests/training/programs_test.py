@@ -82,6 +82,7 @@ class CompareTest(FolderTest):
         second, out = self.run_program('actions', self.action, '--seeds', '1', '2')
         self.assertEqual(second, [(action, 2) for action, _ in first])
         self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
+        self.assertIn('in `FSM_Dog2D_Terrain_Mixed-v0`', out)
         message = 'samples is 32768.*, not 100.*; give another --json'
         with self.assertRaisesRegex(ValueError, message):
             self.run_program('actions', self.action, '--samples', '100')
@@ -116,6 +117,8 @@ class CompareTest(FolderTest):
     @parameterized.parameters(
         (compare.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
         (compare.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
+        (compare.refine_gaits, 'selection', {'changes': '', 'changes_first': 0, 'substeps': 1}),
+        (compare.refine_gaits, 'less', {'changes': 'all', 'noise': 0.02, 'changes_first': 16}),
     )
     def test_a_run_has_the_settings_of_its_action(self, trainer, action, expected):
         result = {'distance': 3.0, 'distance_interval': [], 'median_distance': 2, 'speed': 1}
@@ -123,7 +126,7 @@ class CompareTest(FolderTest):
 
         def train(id_, seed, own, folder, threads):
             asked.append(own)
-            folder.mkdir(parents=True)
+            folder.mkdir(parents=True, exist_ok=True)
             policies.save(policies.reference(id_), folder / 'policy.npz')
             return [{'samples': 8, 'distance': 3.0}]
 
@@ -131,8 +134,10 @@ class CompareTest(FolderTest):
             mock.patch.object(evaluation, 'evaluate', lambda *_: result),
             mock.patch.object(trainer, 'train', train),
         ):
-            found = compare.train_actions(action, 3, 64, self.folder / 'run')
-        expected = {**expected, 'samples': 64, 'evaluate_every': 16}
+            changes = trainer is compare.refine_gaits
+            job = compare.train_changes if changes else compare.train_actions
+            found = job(action, 3, 64, self.folder / 'run')
+        expected = {**expected, 'samples': 64, 'evaluate_every': 8 if changes else 16}
         self.assertEqual({name: getattr(asked[0], name) for name in expected}, expected)
         self.assertEqual((found['curve'], found['distance']), ([[8, 3.0]], 3.0))
 
