@@ -27,6 +27,7 @@ from helpers import (
 from trl_suite import characters, describe, motion, policies, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
+from trl_suite.tasks import parts
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -524,6 +525,20 @@ class ConstructionTest(parameterized.TestCase):
         mjcf.Physics.from_xml_string('<mujoco/>')  # dm_control keeps the last model it parsed
         gc.collect()
         self.assertEqual([each() for each in freed], [None, None])
+
+    @parameterized.parameters(
+        {}, {'levels': (0, 9)}, {'sensors': 'mild'}, {'randomize': 'mild'},
+        {'actuators': {'delay': 20}}, {'rewards': {'fast': (0.1, parts.speed)}},
+    )  # fmt: skip
+    def test_close_frees_many_simulations_at_once(self, **options):
+        """Not when Python collects garbage: a learner may make new ones in every stage."""
+        environments = VectorEnvironment('PD_Biped2D_Flat-v0', 2, 1, task_kwargs=options)
+        environments.reset()
+        freed = weakref.ref(environments.core.world)
+        gc.disable()
+        self.addCleanup(gc.enable)
+        environments.close()
+        self.assertIsNone(freed())
 
 
 class ThreadsTest(parameterized.TestCase):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import weakref
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,6 @@ class Component:
     `finish` after both.
 
     Attributes:
-      task: the task, after `added_to`.
       blocks: observation blocks that follow those of the task.
       saved: state: tuples of arrays (n, ...).
       info_arrays: further results, see `Task.info_arrays`.
@@ -44,7 +44,12 @@ class Component:
 
     def added_to(self, task: Task) -> None:
         """Keeps the task. A subclass may raise a ValueError if it does not fit."""
-        self.task = task
+        self._task = weakref.ref(task)  # a cycle would keep closed simulations in memory
+
+    @property
+    def task(self) -> Any:
+        """The task, after `added_to`."""
+        return self._task()
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:

@@ -76,7 +76,7 @@ class Pushes(Component):
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
         super().bind(world, outcome)
-        task: Any = self.task
+        task = self.task
         pushes: Any = world.engine.pushes
         links, spec = task.body.links, task.character.spec
         push, k = self._config, self._series

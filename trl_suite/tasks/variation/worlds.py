@@ -162,7 +162,7 @@ class Worlds(Component):
         return {'randomize': (str(self._config.changed), self._config)}
 
     def bind(self, world: World, outcome: Outcome) -> Outcome:
-        task: Any = self.task
+        task = self.task
         body, varied = task.body, self._config.varied
         constants = getattr(task.root_entity, 'set_inertia', None)
         dofs = body.pose_dof[6 if self._spatial else 3 :]
