@@ -554,8 +554,9 @@ class ControllerTest(FolderTest):
                 found = several.step(np.append(action, choice))
             for name, value in expected.observation.items():
                 np.testing.assert_array_equal(found.observation[name], value)
-        names = several.action_map.names
-        self.assertEqual(names, (*hierarchical.PLAN_NAMES, 'controller_0', 'controller_1'))
+            self.assertEqual(several.info['controller'], ids.index(id_))
+        names = [f'controller_{k}: {id_}' for k, id_ in enumerate(ids)]
+        self.assertEqual(several.action_map.names, (*hierarchical.PLAN_NAMES, *names))
         np.testing.assert_array_equal(several.task.mirror.action_sign, (1, -1, 1, -1, -1, 1, 1))
         with self.assertRaisesRegex(ValueError, 'takes the footstep plan of .*controller_1'):
             plan.check(several)

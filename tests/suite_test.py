@@ -49,7 +49,7 @@ OTHER_TYPES = (
     (lambda: suite.build('dog', clip=3), 'clip is a name, a file, a Clip or FootstepLibrary, not 3'),
     (lambda: suite.make(GAPS, 3), 'task_kwargs is 3; expected a dict'),
     (lambda: suite.make(GAPS, None, 'x'), "environment_kwargs is 'x'; expected a dict"),
-    (lambda: suite.make(HIGH, {'controller': 3}), 'controller is 3; expected a policy'),
+    (lambda: suite.make(HIGH, {'controller': 3}), 'controller is 3; expected the id of an environment'),
 )  # fmt: skip
 DO_NOT_FIT = (  # arguments of `suite.build`
     ({'character': 'dog', 'terrain': 'hills3d'},

@@ -6,8 +6,8 @@
 
 It starts from the shipped planner, by PPO; an interrupted run continues from its checkpoint in --output. With
 several controllers the planner selects one in every step, or with --each it is trained with all of them side
-by side, each in as many simulations. The results of `evaluate_plans.py` with this planner are written to
-trained/plans.json.
+by side, each in as many simulations. The results of `evaluate_plans.py` with this planner are printed, and with
+--enter written to trained/plans.json, for the report.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from trl_suite import policies, suite
 from trl_suite.util.program import begin_script
 
 SAMPLES = 2.4e5  # footsteps
-EPISODES = 32
 
 
 def fine_tuned(id_: str, samples: float, *controllers: Any) -> Settings:
@@ -56,6 +55,8 @@ def main() -> None:
     parser.add_argument('--each', action='store_true', help='train with each, instead of selecting')
     parser.add_argument('--samples', type=float, default=SAMPLES, help='footsteps')
     parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--episodes', type=int, default=32, help='of the evaluation')
+    parser.add_argument('--enter', action='store_true', help='write results to trained/plans.json')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     arguments = parser.parse_args()
     id_, ids = suite.find(arguments.id).id, [suite.find(each).id for each in arguments.controllers]
@@ -67,13 +68,14 @@ def main() -> None:
     policy = policies.load(folder / 'policy.npz')
     for controller in parts:
         result = evaluate_plans.run(
-            id_, lambda environments: policy, EPISODES, 0, controller=controller
+            id_, lambda environments: policy, arguments.episodes, 0, controller=controller
         )
         under = how + (controller if isinstance(controller, str) else ', '.join(controller))
-        found = runs.read('plans.json')
-        found.setdefault(id_, {})[under] = result
-        runs.write('plans.json', found)
-        print(under, {name: round(value, 3) for name, value in result.items()})
+        print(under, {name: round(value, 3) for name, value in result.items()}, flush=True)
+        if arguments.enter:
+            found = runs.read('plans.json')
+            found.setdefault(id_, {})[under] = result
+            runs.write('plans.json', found)
 
 
 if __name__ == '__main__':

@@ -101,5 +101,8 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
     if callable(source):
         return Controller(source, getattr(source, '__name__', type(source).__name__))
     if not isinstance(source, (str, os.PathLike)):
-        raise TypeError(f'controller is {source!r}; expected a policy, its file or a function')
+        raise TypeError(
+            f'controller is {source!r}; expected the id of an environment, a policy, its file, a '
+            'function, or a list of them'
+        )
     return Controller(policies.load(source), repr(os.fspath(source)))

@@ -17,7 +17,7 @@ from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.common import goals
 from trl_suite.tasks.navigation import direct, hierarchical_rules
-from trl_suite.tasks.navigation.hierarchical import CHOICE, PLAN_NAMES
+from trl_suite.tasks.navigation.hierarchical import CHOICE
 from trl_suite.tasks.rewards import fall_condition
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
@@ -188,9 +188,11 @@ def _plans(task: Any) -> list[str]:
 def _plan_action(environment: Environment) -> Section:
     """Returns the table of what each action plans."""
     names = environment.action_map.names
-    meanings = [_MEANINGS.get(name, 'action of the footstep controller') for name in names]
-    for k, controller in enumerate(environment.task.controllers if CHOICE + '0' in names else ()):
-        meanings[len(PLAN_NAMES) + k] = f'the largest selects the controller; {controller.name}'
+    joint, choice = (
+        'action of the footstep controller',
+        'the largest selects the footstep controller',
+    )
+    meanings = [_MEANINGS.get(name, choice if name.startswith(CHOICE) else joint) for name in names]
     return actions(environment.action_map, ('sets', 'unit and meaning'), meanings)
 
 

@@ -38,8 +38,9 @@ def _step(
     preset: str = 'plane',
     **given: Any,
 ) -> EnvSpec:
+    fits = 'mirrored' not in given and character != 'biped3d_full_mocap'  # planned environments
     return _spec(
-        ('spatial',) if 'mirrored' in given else ('spatial', 'controller'),
+        ('spatial', 'controller') if fits else ('spatial',),
         id=id_,
         task=task,
         character=character,

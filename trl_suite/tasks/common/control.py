@@ -39,7 +39,10 @@ def planar_heights() -> Any:
 
 def terrain_maps(default: str | tuple[str, ...] = ()) -> Any:
     """Returns the option of maps of the terrain in three dimensions."""
-    meaning = "observed maps of the terrain: 'height', 'velocity', both, or () for none"
+    meaning = (
+        "observed maps of the terrain: 'height' (block terrain), 'velocity' (block surface), both, or () "
+        'for none'
+    )
     return option(default, meaning, choices=MAPS)
 
 

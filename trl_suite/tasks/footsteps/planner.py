@@ -81,7 +81,12 @@ class Plans(Config):
         at_least=0,
         at_most=1,
     )
-    stay: Range = option(Range(4, 40), 'number of steps for which it then stays', at_least=1)
+    stay: Range = option(
+        Range(4, 40),
+        'number of footsteps of the clock for which it then stays',
+        unit='footsteps',
+        at_least=1,
+    )
     react: float = option(
         0.0,
         'share of the landing error by which a plan moves with the walker at each landing: 0, landing '

@@ -63,7 +63,9 @@ class PlanarFootstepsConfig(PlanarConfig):
     """Options of `PlanarFootsteps`."""
 
     plans: StraightPlans = option(
-        None, 'how footstep plans are drawn: a mapping of fields of StraightPlans'
+        None,
+        'how footstep plans are drawn: a mapping of fields of StraightPlans, instead of that of the '
+        'environment',
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     footstep_scale: float = option(1.0, FOOTSTEP_SCALE, at_least=0)
@@ -73,7 +75,10 @@ class PlanarFootstepsConfig(PlanarConfig):
 class SpatialFootstepsConfig(MirroredConfig):
     """Options of `SpatialFootsteps`."""
 
-    plans: Plans = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
+    plans: Plans = option(
+        None,
+        'how footstep plans are drawn: a mapping of fields of Plans, instead of that of the environment',
+    )
     goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
     pushes: PushConfig | None = option(
         None,

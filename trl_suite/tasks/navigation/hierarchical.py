@@ -55,7 +55,7 @@ FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
 # at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
 PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
-CHOICE = 'controller_'  # and an index: actions that select one of several controllers
+CHOICE = 'controller_'  # with index and name: actions that select one of several controllers
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
@@ -180,13 +180,15 @@ class HierarchicalNavigation(GoalTask):
         count = len(self.controllers)
         if not count or (count > 1 and not by_plan):
             raise ValueError(
-                f'controller: a list of {count}, with the interface {self.interface!r}; expected one, or '
-                "several with the interface 'plan'"
+                f'controller: a list of {count}, with the interface {self.interface!r}; expected at least '
+                "one, or with the interface 'frame' exactly one"
             )
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         joints = None if by_plan else self.joint_map
-        self.action_map = plan_action_map(self.step_length, joints, count)
+        names = [each.policy.id if each.policy else each.name for each in self.controllers]
+        choices = tuple(f'{CHOICE}{k}: {name}' for k, name in enumerate(names) if count > 1)
+        self.action_map = plan_action_map(self.step_length, joints, choices)
         controller = Block(
             'low_level',
             sum(block.size for block in self._controller_blocks),
@@ -221,6 +223,7 @@ class HierarchicalNavigation(GoalTask):
             'landing_error': self.plan.landing_error,
             'heading_error': self.plan.heading_error,
             'duration': self.state.duration,
+            **({'controller': self.state.controller} if len(self.controllers) > 1 else {}),
         }
         self._controller_observation = np.zeros((n, sum(block.size for block in blocks)))
         self._joint_action = np.zeros((n, len(self.joint_map)))
@@ -330,7 +333,7 @@ class HierarchicalNavigation(GoalTask):
 
 
 def plan_action_map(
-    step_length: float, joint_map: ActionMap | None = None, controllers: int = 1
+    step_length: float, joint_map: ActionMap | None = None, choices: tuple[str, ...] = ()
 ) -> ActionMap:
     """Returns the map from actions to plans.
 
@@ -338,11 +341,9 @@ def plan_action_map(
       step_length: step length of the plan at action 0, m.
       joint_map: the map of actions to joint targets, with the interface 'frame': these actions
         follow those of the plan, and are passed on as they are.
-      controllers: number of footstep controllers; for several, a number for each follows.
+      choices: names of the numbers that select a footstep controller, which follow.
     """
-    more = () if joint_map is None else joint_map.names
-    if controllers > 1:
-        more = tuple(f'{CHOICE}{k}' for k in range(controllers))
+    more = choices if joint_map is None else joint_map.names
     offset = np.append(step_length * PLAN_OFFSET, np.zeros(len(more)))
     scale = np.append(PLAN_SCALE, np.ones(len(more)))
     return ActionMap((*PLAN_NAMES, *more), 'footstep plan', 'm (turn: rad)', offset, scale)
