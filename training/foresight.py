@@ -1,4 +1,4 @@
-"""Searches, with full foresight, how far a gait gets over a terrain at all, whatever its policy.
+"""Searches with full foresight how far a gait gets over a terrain, and writes trained/foresight.json.
 
     python training/foresight.py FSM_Dog2D_Terrain_Stairs_Rugged-v0
 
@@ -7,7 +7,7 @@ have not fallen are kept. If all fall, the search goes back by some cycles and d
 the distance asked, or with the budget of cycles. Of each terrain there are two searches: with base
 actions alone, and with normal noise in all parameters. If the first gets farther than the policy, the
 selection is its limit; if the second gets farther than the first, base actions are. The search is greedy:
-what it does not reach may be possible. Results: `trained/foresight.json`.
+what it does not reach may be possible.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import argparse
 import time
 from typing import Any
 
+import learn_gaits
 import numpy as np
 import runs
 import tqdm
 from gait_bench import position
 
 from trl_suite import suite
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -78,8 +80,10 @@ def main() -> None:
     parser.add_argument('--budget', type=float, default=6e3, help='cycles for each search')
     parser.add_argument('--seed', type=int, default=runs.EVALUATION_SEED + 2)
     arguments = parser.parse_args()
+    checked('--metres', arguments.metres, float, above=0)
     for name in arguments.ids:
         id_, begin = suite.find(name).id, time.process_time()
+        learn_gaits.environments_of(id_, learn_gaits.Settings())  # it has a gait
         rng = np.random.default_rng(arguments.seed)
         options = {'autoreset': 'disabled', 'step_limit': None}
         starts = VectorEnvironment(id_, arguments.episodes, 1, arguments.seed, **options)

@@ -19,7 +19,8 @@ Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command cont
 identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
 curve), `last.npz` (the current averaged network), and at the end `policy.npz`: the result of a final
 phase without new samples, in which a new network learns from the replay with a falling learning rate
-(with an initial policy the same network continues). With `--members 4` four networks learn in this
+(with an initial policy the same network continues). In the first cycles, if the environment has a shipped
+policy, that one acts (setting `expert_cycles`; 0: none). With `--members 4` four networks learn in this
 phase, and the policy has the mean of their values, whose errors are smaller. A run may learn over
 several environments of one character at a time, and may learn in rounds: the policy collects, then
 learns anew from the replay.
@@ -48,6 +49,7 @@ from several import Several
 from torch import nn
 
 from trl_suite import evaluation, policies
+from trl_suite.cli.arguments import positive
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import errors
@@ -274,8 +276,8 @@ class Replay:
 
 
 def initial_policy(start: str) -> policies.Policy:
-    """Returns the shipped policy of an environment, or the policy in a file."""
-    return (policies.reference if start in policies.available() else policies.load)(start)
+    """Returns the policy in a file, or the shipped one of an environment."""
+    return (policies.load if start.endswith('.npz') else policies.reference)(start)
 
 
 def environments_of(id_: str, settings: Settings) -> list[str]:
@@ -391,7 +393,8 @@ class Learner:
         line, *_ = policy.networks[0]
         if line is None or not np.array_equal(policy.columns, self.columns):
             raise ValueError(
-                f'the network of {policy.id} has other inputs; expected one that learn_gaits.py trained'
+                f'the network of {policy.id} has other inputs than that of {self.ids[0]}; expected one that '
+                'learn_gaits.py trained for the same character'
             )
         known = self.choices[: len(policy.choices)]
         if policy.choices.shape != known.shape or (
@@ -740,6 +743,7 @@ def train(
         differ.
       RuntimeError: another process trains in the folder.
     """
+    environments_of(id_, settings)  # before there is a folder
     with runs.only_run(folder):
         return _train(id_, seed, settings, folder, threads)
 
@@ -781,7 +785,13 @@ def report(curve: list[dict[str, Any]], folder: pathlib.Path) -> None:
 
 
 def main() -> None:
-    further = {'action': {'choices': ACTIONS}, 'members': {'type': int}}
+    further = {
+        'action': {
+            'choices': ACTIONS,
+            'help': 'what an action sets; see the beginning of this file',
+        },
+        'members': {'type': positive, 'help': 'number of networks of the policy'},
+    }
     id_, seed, changes, folder, threads = runs.command_line(
         __doc__.splitlines()[0], 'cycles', further
     )

@@ -1,4 +1,4 @@
-"""Measures whether other actions could have prevented the falls of a policy.
+"""Measures which falls other actions could have prevented, and writes trained/oracles.json.
 
     python training/oracles.py FSM_Dog2D_Terrain_Mixed-v0 --falls 24
     python training/oracles.py PD_Raptor2D_Mixed_Terrain-v0 --falls 32 --tries 32

@@ -16,7 +16,7 @@ with `--changes each` one for each base action. They are 0 at the beginning.
 After a fall most simulations return to a state a few cycles earlier, as in `learn_gaits.py`; these
 retries end a trajectory, and the actions after them are those of the policy.
 
-Without `--start` the policy is first learnt by `learn_gaits.py`, with the settings of the
+Without `--start`, or a setting `start` of the environment, the policy is first learnt by `learn_gaits.py`, with the settings of the
 environment, in the folder OUTPUT/ID/seed_S/first. Writes into OUTPUT/ID/seed_S: `checkpoint.pt`
 (everything; the same command continues from it with identical results, and with a larger
 `--samples` for longer), `curve.json` (settings, learning curve) and `policy.npz`.
@@ -429,9 +429,9 @@ def train(
         differ.
       RuntimeError: another process trains in the folder.
     """
+    simulated(id_, settings)  # before Q-learning, and before there is a folder
     with runs.only_run(folder):
         torch.set_num_threads(1)
-        simulated(id_, settings)  # before Q-learning
         initial, before = first_policy(id_, seed, settings, folder, threads)
         refiner, s = Refiner(id_, seed, settings, threads, initial), settings
         if (folder / 'checkpoint.pt').exists():
@@ -453,8 +453,14 @@ def train(
 
 
 def main() -> None:
+    further = {
+        'start': {
+            'help': 'initial policy: id of an environment, whose shipped policy it is, or a file'
+        },
+        'changes': {'choices': CHANGES, 'help': 'of the selected action, to be learnt as well'},
+    }
     id_, seed, changes, folder, threads = runs.command_line(
-        __doc__.splitlines()[0], 'cycles', {'start': {}, 'changes': {'choices': CHANGES}}
+        __doc__.splitlines()[0], 'cycles', further
     )
     curve = train(id_, seed, settings_for(id_, **changes), folder, threads)
     learn_gaits.report(curve, folder)

@@ -26,6 +26,7 @@ import torch
 
 from trl_suite import suite
 from trl_suite.util import files, resources
+from trl_suite.util.options import checked
 
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
 FORMAT = b'trl_suite checkpoint 1\n'
@@ -58,9 +59,11 @@ def command_line(
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
     for name, keywords in (further or {}).items():
-        parser.add_argument(f'--{name}', help='instead of the default', **keywords)
+        parser.add_argument(f'--{name}', **keywords)
     chosen = parser.parse_args()
     id_ = suite.find(chosen.id).id
+    checked('--seed', chosen.seed, int, at_least=0)
+    checked('--samples', chosen.samples, float | None, above=0)
     given = {name: getattr(chosen, name) for name in ('samples', *(further or ()))}
     changes = {name: value for name, value in given.items() if value is not None}
     return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
@@ -140,9 +143,23 @@ def load_run(
       ValueError: as `load`, or the checkpoint has other settings.
     """
     state, own = load(folder / 'checkpoint.pt'), dataclasses.asdict(settings)
-    if {**state['settings'], **{name: own[name] for name in changeable}} != own:
-        raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+    found = {**state['settings'], **{name: own[name] for name in changeable}}
+    if found != own:
+        others = ', '.join(different(found, own))
+        raise ValueError(
+            f'{folder} holds a run with other settings: {others}; give another --output, or remove it'
+        )
     return state
+
+
+def different(found: Mapping[str, Any], asked: Mapping[str, Any], owner: str = '') -> Iterator[str]:
+    """Yields in which settings, also those of a setting, a run differs from what is asked."""
+    for name in dict.fromkeys((*found, *asked)):
+        one, other = found.get(name), asked.get(name)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            yield from different(one, other, f'{owner}{name}.')
+        elif one != other:
+            yield f'{owner}{name} is {one!r}, not {other!r}'
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Evaluates a trained gait policy on other terrains of its character, and ships it where it is better.
+"""Evaluates a gait policy on other terrains, and ships it in trained/ where it is better.
 
     python training/share_gaits.py FSM_Dog2D_Terrain_Mixed-v0 FSM_Dog2D_Terrain_Gaps-v0
     python training/share_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 FSM_Raptor2D_Terrain_Slopes-v0 \

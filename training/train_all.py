@@ -61,7 +61,7 @@ ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # a row of the table of runs
 MEMORY = 1.5e9  # bytes of memory that Ray reserves for a run
 GAITS = (  # gait environments that are trained by default
     *(f'FSM_Dog2D_Terrain_{name}-v0' for name in ('Mixed', 'Cliffs', 'Slopes_Mixed', 'Stairs_Rugged')),
-    *(f'FSM_Raptor2D_Terrain_{name}-v0' for name in ('Mixed', 'Slopes_Mixed')),
+    *(f'FSM_Raptor2D_Terrain_{name}-v0' for name in ('Mixed', 'Slopes_Mixed', 'Narrow_Gaps')),
     *(f'FSM_Goat2D_Terrain_{name}-v0' for name in ('Cliffs', 'Variable_Steps')),
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
 )  # fmt: skip
@@ -241,17 +241,27 @@ def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     return Run(entry, policy, platform.node(), time.monotonic() - begin)
 
 
-def enter(id_: str, seed: int, run: Run) -> None:
+def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
     """Enters a run into the file of its environment, and ships its policy if it is the best.
+
+    A run with other settings than those that are entered replaces them, if its score is higher or with
+    `overwrite`.
 
     Of several seeds the best one is chosen in the episodes of `evaluation`; a mean over seeds is not
     affected by the choice, but the evaluation of the chosen one is, so it is evaluated once more in
     episodes that had no part in it.
     """
-    own = run.entry
-    others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == own['settings']]
-    every = sorted([own, *others], key=lambda r: r['seed'])
-    best = max(every, key=lambda r: r['evaluation']['return'])
+    own, score, before = run.entry, TASK_TYPES[catalogue.BY_ID[id_].task_type].score, entries(id_)
+    others = [r for r in before if r['settings'] == own['settings']]
+    found = own['evaluation'][score]
+    most = max((r['evaluation'][score] for r in before), default=found)
+    if not (others or overwrite) and most > found:
+        print(
+            f'{id_}: not entered, since {score} is {found:.3f}, and {most:.3f} with the shipped policy'
+        )
+        return
+    every = sorted([own, *(r for r in others if r['seed'] != seed)], key=lambda r: r['seed'])
+    best = max(every, key=lambda r: r['evaluation'][score])
     if best is own:
         runs.place('').mkdir(parents=True, exist_ok=True)
         policies.save(run.policy, runs.place(f'{id_}.npz'))
@@ -262,7 +272,7 @@ def enter(id_: str, seed: int, run: Run) -> None:
         )
     runs.write(f'{id_}.json', entry)
     used = runs.read(policies.SHARED)
-    if id_ in used and used[id_]['evaluation']['return'] < best['evaluation']['return']:
+    if id_ in used and used[id_]['evaluation'][score] < best['evaluation'][score]:
         del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
         runs.write(policies.SHARED, used)
 
@@ -346,7 +356,7 @@ def main(words: Sequence[str] | None = None) -> None:
                 raise RuntimeError('not trained, since a run failed whose policy it uses')
             run = done_by(id_, seed)
             with entering:
-                enter(id_, seed, run)
+                enter(id_, seed, run, arguments.overwrite)
             return run
 
         running: dict[concurrent.futures.Future, tuple[str, int]] = {}

@@ -286,6 +286,8 @@ class LearnTest(FolderTest):
         more = dataclasses.replace(settings, members=settings.members + 1)
         learn_gaits.train(HOPPER, 1, more, folder, 1)
         self.assertLen(policies.load(folder / 'policy.npz').networks, more.members)
-        with self.assertRaisesRegex(ValueError, 'other settings'):
+        with self.assertRaisesRegex(
+            ValueError, 'other settings: alive is .*, not 1.0; give another --output'
+        ):
             other = dataclasses.replace(settings, alive=1.0)
             learn_gaits.train(HOPPER, 1, other, folder, 1)

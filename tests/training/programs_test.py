@@ -256,14 +256,34 @@ class JobsTest(FolderTest):
     @parameterized.parameters((20.0, False), (22.0, True))
     def test_a_better_run_replaces_the_policy_of_another_environment(self, returned, better):
         id_, other = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0'
-        entry = {'policy': other, 'evaluation': {'return': 21.0}}
+        entry = {'policy': other, 'evaluation': {'distance': 21.0}}
         (self.folder / policies.SHARED).write_text(json.dumps({id_: entry}))
-        entry = {'seed': 1, 'settings': {}, 'evaluation': {'return': returned}}
+        entry = {'seed': 1, 'settings': {}, 'evaluation': {'distance': returned}}
         run = train_all.Run(entry, policies.reference(id_), 'here', 1.0)
         with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
             train_all.enter(id_, 1, run)
             self.assertEqual(policies.trained_for(id_), id_ if better else other)
             self.assertIn(id_, policies.available())
+
+    def test_a_worse_run_with_other_settings_is_not_entered(self):
+        id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
+        policy = policies.reference(id_)
+
+        def enter(samples, distance, **options):
+            settings = {**train_all.settings(id_), 'samples': samples}
+            entry = {'seed': 1, 'settings': settings, 'evaluation': {'distance': distance}}
+            other = dataclasses.replace(policy, info={'samples': samples})
+            run = train_all.Run(entry, other, '', 1.0)
+            out = output(lambda: train_all.enter(id_, 1, run, **options))
+            return policies.load(self.folder / f'{id_}.npz').info['samples'], out
+
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+            self.assertEqual(enter(2e6, 100.0), (2e6, ''))
+            shipped, out = enter(100.0, 3.0)
+            self.assertEqual(shipped, 2e6)
+            self.assertIn('distance is 3.000, and 100.000 with the shipped policy', out)
+            self.assertEqual(enter(2e6, 90.0)[0], 2e6)  # the same run again
+            self.assertEqual(enter(100.0, 3.0, overwrite=True)[0], 100)
 
     def test_a_policy_that_others_use_is_kept(self):
         for id_ in 'abcd':
