@@ -339,6 +339,11 @@ class RunTest(RunCase):
             self.run_short(Keeper())
         self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
         self.assert_only('result.json', 'result.stage1')
+        (self.folder / 'result.stage1').rename(self.folder / 'lost')
+        with self.assertRaisesRegex(
+            FileNotFoundError, "no such folder, the learner's state after 1"
+        ):
+            self.run_short(Keeper())
 
     def test_two_runs_that_write_one_result(self):
         """The second one is refused as long as the first one lasts."""
