@@ -593,6 +593,19 @@ class ProgramTest(CommandTest):
         self.assertEndsWith(done.stdout, '\n4 environments\n')
         self.assertStartsWith(self.program('--help').stdout, 'usage: python -m trl_suite [-h]')
 
+    def test_help_of_every_command(self):
+        commands, found = [()], []
+        while commands:
+            command = commands.pop()
+            text = self.output(*command, '--help')
+            self.assertStartsWith(text, ' '.join(('usage: trl-suite', *command)))
+            found.append(command)
+            for name in re.findall(
+                r'^    ([a-z]+)(?= |$)', text.split('\noptions:')[0], re.MULTILINE
+            ):
+                commands.append((*command, name))
+        self.assertContainsSubset([('info',), ('benchmark', 'verify'), ('sequences', 'run')], found)
+
     def assert_one_error(self, done, message):
         self.assertEqual((done.returncode, done.stdout), (2, ''))
         self.assertRegex(done.stderr, f'^trl-suite: error: [^\n]*{message}[^\n]*\n$')

@@ -19,7 +19,9 @@ def declare(commands: Any) -> None:
     """Declares the commands, their actions, and their arguments."""
     text = 'list the environments, with the scores that are 0 and 1'
     actions = _add(commands, 'benchmark', 'benchmark of learning algorithms', text, _list)
-    text = 'train a learner on environments of the core set, and test it after every 5 %'
+    text = (
+        'train a learner on environments of the core set, and test it after each of its 20 stages'
+    )
     command = _add_run(actions, text, _run, '1M', '10M')
     text = 'environment of the core set; by default all, one after the other'
     command.add_argument('ids', nargs='*', metavar='ID', help=text)
