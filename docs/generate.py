@@ -49,10 +49,8 @@ NAMES = (  # parts of ids
     ('`FULL`', 'the three-dimensional biped with arms and head'),
     (
         '`…_Terrain-v0` of a biped, dog or raptor',
-        'PLAiD: the ground is observed; without this part, it is flat or not observed',
+        'the ground is observed; without this part, it is flat or not observed',
     ),
-    ('PLAiD', 'progressive learning and integration via distillation (Berseth et al. 2018)'),
-    ('simbicon', 'a biped and its gait after SIMBICON (Yin, Loken, van de Panne 2007)'),
 )
 WITHOUT = {  # policies shown for environments without a shipped policy
     'scripted': 'the hand-written policy (`--policy scripted`)',
@@ -278,8 +276,9 @@ def environment_index() -> str:
         'Environments',
         f'{len(catalogue.SPECS)} environments in {len(catalogue.FAMILIES)} families; a trained policy is shipped '
         f'for {len(policies.available())} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
-        'character, actuation, terrain or tag, and `trl-suite info ID` describes one. The ids '
-        'are those of the original, including its misspellings.',
+        'character, actuation, terrain or tag, and `trl-suite info ID` describes one. Ids of the original keep its '
+        'spelling. PLAiD is progressive learning and integration via distillation (Berseth et al. 2018); `simbicon` '
+        'characters have a gait after SIMBICON (Yin, Loken, van de Panne 2007).',
         table(('part of an id', 'meaning'), NAMES),
         *parts,
     )
@@ -394,11 +393,11 @@ def terrain_index() -> str:
             )
             for name, ground in names.items()
         ]  # fmt: skip
-        header = ('preset', 'type', 'description', 'parameter sets', 'environments')
+        header = ('preset', 'type', 'ground of this type', 'parameter sets', 'environments')
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Terrains',
-        'Terrain is generated anew in every episode. `trl-suite terrain NAME` plots random samples of a '
+        'Terrain is generated anew in every episode, except `cliff3d`. `trl-suite terrain NAME` plots random samples of a '
         'preset or of a parameter file. For terrain from a function, an image or a mesh see '
         '[Make your own](make_your_own.md).',
         *parts,

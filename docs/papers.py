@@ -181,7 +181,7 @@ def plans() -> str:
          f'{found["reference"]["survived"]:.0%}')
         for id, found in stored('plans').items() if 'scripted' in found
     ]  # fmt: skip
-    return table(('planner', 'score, hand-written', 'score, trained', 'no fall in 200 s'), rows)
+    return table(('planner', 'score, scripted', 'score, trained', 'no fall in 200 s'), rows)
 
 
 def foresight() -> str:

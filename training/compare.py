@@ -4,7 +4,7 @@
     python training/compare.py changes --seeds 1 2 3 --json docs/data/gait_changes.json
     python training/compare.py hierarchy --seeds 1 2 3 --json docs/data/hierarchy.json \
         --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
-    python training/compare.py limits --seeds 1 2 3 --samples 1e6 --page docs/reports/robustness.md
+    python training/compare.py limits --seeds 1 2 3 --samples 5e5 --page docs/reports/robustness.md
 
 `actions`: base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
 `changes`: the selection of base actions by a shipped policy, trained on with PPO, alone and with changes.

@@ -197,8 +197,8 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of the default gait, in the same '
             f'{train_all.GAIT_EPISODES} episodes, which are truncated after {terrainrl.STEP_LIMIT} cycles; speed in '
-            'm/s. *Decisions*: simulated cycles of training.',
-            ('environment', 'trained', 'default', 'ratio', 'mean', 'default', 'speed', 'decisions', 'seed'),
+            'm/s. *Cycles*: simulated in training.',
+            ('environment', 'trained', 'default', 'ratio', 'mean', 'default', 'speed', 'cycles', 'seed'),
             gait_rows(entries),
         ),
         (
@@ -244,7 +244,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'percentile, and mean heading error in rad. *General*: the plans of the environment, with sharp turns; '
             '*made from the root*: relative to the root, as in the high-level environments; *pushes*: forces on the '
             'torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
-            ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'),
+            ('condition', 'episodes', 'no fall', 'reward', 'landing', '90 %', 'heading'),
             footstep_rows(),
         ),
         (
@@ -285,12 +285,12 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'beside the mean and the number of all seeds. *Return* is '
         'divided by its maximum; the reward is 0 after a fall; the interval is of the episodes that were run, and too '
         'narrow where a fall is so rare that none of them has one. *Complete*: share of episodes that last to the '
-        'end (256 steps; planned footsteps 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
+        'end (256 steps; planning environments 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
         'thread of a shared machine. *Initial policy*: where training starts, its samples '
         'not included; or what is imitated first, samples included: `scripted`, the hand-written policy; `expert` and '
         '`joint_expert`, [experts with a map](../training/expert.py) for footsteps and for joint targets; `nominal`, '
         'the policy of `PD_Biped3D_LLC_General_Step-v0`.',
-        '## Environments with a policy, except gaits',
+        '## Environments except gaits',
         table(
             ('environment', 'return, 95 %', 'mean of seeds', 'complete', 'distance', 'samples', 'minutes',
              'seed', 'initial policy'),

@@ -4,7 +4,7 @@ A result is a dict, written as JSON:
 
 * 'format': the benchmark and its version; 'trl_suite': version of the package; 'learner': module
   and class.
-* 'mujoco': version of the engine; 'cpu': class of the processor, or of several, if the run was
+* 'mujoco': version of the engine; 'cpu': class of CPU, or of several, if the run was
   resumed on another. 'policy': SHA-256 of the file of the last policy, if the learner's `policy()`
   is a `policies.Policy`. Results without these three are valid.
 * The settings: name of the `Course`, 'ids' (T), 'budget' (samples per environment), 'episodes' (per

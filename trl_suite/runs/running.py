@@ -24,7 +24,7 @@ from trl_suite.util import files, machine
 from trl_suite.util.options import checked
 
 SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
-TOLERANCE = 0.05  # of scores that are measured again on another class of processor
+TOLERANCE = 0.05  # of scores that are measured again on another class of CPU
 
 
 @runtime_checkable
@@ -206,7 +206,7 @@ class Benchmark(results.Format):
 
         Returns:
           The result, and by how much scores were allowed to differ: 0, or `TOLERANCE` if it was made
-          with another version of MuJoCo or on another class of processor.
+          with another version of MuJoCo or on another class of CPU.
 
         Raises:
           ValueError: the result or the policy is invalid, there is no policy, or its scores differ by
