@@ -47,7 +47,8 @@ TEACHERS: dict[str, Callable[..., Any]] = {
     'nominal': lambda environments: policies.reference('PD_Biped3D_LLC_General_Step-v0'),
 }
 _STATE = (  # what a checkpoint holds besides what `learnt` returns
-    'begun', 'samples', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns', 'steps',
+    'begun', 'samples', 'current', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns',
+    'steps',
 )  # fmt: skip
 
 
@@ -87,7 +88,7 @@ class Trainer:
         self.seed, self.settings, self.threads, s = seed, settings, threads, settings
         _check(s)
         self.samples = 0
-        self.begin_stage()
+        self.begin_stage(self.stage)
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
             raise ValueError(f'{self.spec.id} has no left and right to mirror')
@@ -137,9 +138,9 @@ class Trainer:
         s = self.settings
         return sum(self.samples >= share * s.samples for share, _ in s.stages)
 
-    def begin_stage(self) -> None:
-        """Makes and resets the simulations of the current curriculum stage."""
-        s, self.current = self.settings, self.stage
+    def begin_stage(self, number: int) -> None:
+        """Makes and resets the simulations of a curriculum stage."""
+        s, self.current = self.settings, number
         self.best = -np.inf  # only policies of the last curriculum stage are shipped
         options = s.stages[self.current - 1][1] if self.current else {}
         groups = options if isinstance(options, tuple) else (options,)
@@ -439,10 +440,9 @@ class Trainer:
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
         state = runs.load_run(folder, self.settings)
-        self.samples = state['samples']
-        if self.stage != self.current:
+        if state['current'] != self.current:
             self.environments.close()
-            self.begin_stage()
+            self.begin_stage(state['current'])
         for name in _STATE:
             setattr(self, name, state[name])
         self.set_learnt(state)
@@ -532,7 +532,7 @@ def _train(
         while trainer.samples < total and not trainer.has_learnt():
             if trainer.stage != trainer.current:
                 trainer.environments.close()
-                trainer.begin_stage()
+                trainer.begin_stage(trainer.stage)
             begin, before = time.perf_counter(), trainer.samples
             if not trainer.begun:
                 trainer.imitate(settings.start, folder)

@@ -166,7 +166,7 @@ def grounds(id_, stages):
     trainer = make(id_, samples=300, stages=stages)
     for samples in (0, 100, 200):
         trainer.samples = samples
-        trainer.begin_stage()
+        trainer.begin_stage(trainer.stage)
         task = trainer.environments.task
         yield [task.arena.grounds[i] for i in range(TINY['num_envs'])]
         assert trainer.spec.terrain == catalogue.BY_ID[id_].terrain  # where it is evaluated
@@ -436,6 +436,10 @@ class RunTest(FolderTest):
     @parameterized.named_parameters(
         ('plain', {}),
         ('two sets of options', {'stages': ((0.0, ({}, {'start_phase': 0.25})),)}),
+        (
+            'another stage from a checkpoint on',
+            {'stages': ((0.0, {}), (0.5, {'terrain': 'slopes'}))},
+        ),
         ('further', {'samples': 256, 'further': ({'value_first': 0.0},)}),
     )
     def test_a_stopped_run_resumes_exactly(self, changes):
