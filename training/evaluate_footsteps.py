@@ -75,10 +75,13 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def row_for(id_: str, terrain: Any) -> EnvSpec:
-    spec = suite.find(id_)
-    options = {k: v for k, v in spec.options.items() if k != 'plans'}
-    return dataclasses.replace(spec, terrain=terrain or spec.terrain, options=options)
+def under(id_: str, condition: str) -> tuple[EnvSpec, dict[str, Any]]:
+    """Returns the spec and the task options of an environment under a condition."""
+    spec, options = suite.find(id_), dict(CONDITIONS[condition])
+    terrain = options.pop('terrain', spec.terrain)
+    options['plans'] = {**spec.options.get('plans', {}), 'stop': 0.0, **options['plans']}
+    own = {k: v for k, v in spec.options.items() if k != 'plans'}
+    return dataclasses.replace(spec, terrain=terrain, options=own), options
 
 
 def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,10 +173,7 @@ def main() -> None:
     )
     written = runs.read('footsteps.json')
     for name in arguments.filter:
-        options = dict(CONDITIONS[name])
-        row = row_for(arguments.id, options.pop('terrain', None))
-        own = suite.find(arguments.id).options.get('plans', {})
-        options['plans'] = {**own, 'stop': 0.0, **options['plans']}
+        row, options = under(arguments.id, name)
         result = run(row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options)
         print(
             f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 import runs
 import tqdm
-from evaluate_footsteps import CONDITIONS, row_for
+from evaluate_footsteps import CONDITIONS, under
 from gait_bench import nudged, position
 
 from trl_suite import policies, suite
@@ -173,8 +173,7 @@ def of_tracking(
 ) -> dict[str, Any]:
     """Returns the results for a number of falls, as they are stored."""
     rng = np.random.default_rng(seed)
-    given = dict(CONDITIONS[condition]) if condition else {}
-    row = row_for(id_, given.pop('terrain', None)) if condition else id_
+    row, given = under(id_, condition) if condition else (id_, {})
     options: dict[str, Any] = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': given}
     environments = VectorEnvironment(row, number, 1, seed, **options)
     rate = 1 / environments.control_timestep

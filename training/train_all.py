@@ -262,6 +262,8 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
         return
     every = sorted([own, *(r for r in others if r['seed'] != seed)], key=lambda r: r['seed'])
     best = max(every, key=lambda r: r['evaluation'][score])
+    if best is not own and runs.read(f'{id_}.json').get('shipped') == seed:
+        every, best = [own], own  # the policy that is replaced is the only one that is stored
     if best is own:
         runs.place('').mkdir(parents=True, exist_ok=True)
         policies.save(run.policy, runs.place(f'{id_}.npz'))

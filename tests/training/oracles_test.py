@@ -106,10 +106,9 @@ class OracleTest(absltest.TestCase):
                 self.assertEqual(found.tolist(), [expected] * 2)
 
     def test_a_footstep_controller_falls_again_after_the_same_push(self):
-        condition = evaluate_footsteps.CONDITIONS['pushes of 250 N']
+        row, given = evaluate_footsteps.under(FOOTSTEPS, 'pushes of 250 N')
         policy = policies.reference(FOOTSTEPS)
-        options = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': condition}
-        row = evaluate_footsteps.row_for(FOOTSTEPS, None)
+        options = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': given}
         environments = VectorEnvironment(row, 2, 1, 0, **options)
         past, _, _ = oracles.falls(environments, policy, 15)
         copies = VectorEnvironment(row, 2, 1, 1, **options)

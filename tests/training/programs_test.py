@@ -269,12 +269,12 @@ class JobsTest(FolderTest):
         id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
         policy = policies.reference(id_)
 
-        def enter(samples, distance, **options):
+        def enter(samples, distance, seed=1, **options):
             settings = {**train_all.settings(id_), 'samples': samples}
-            entry = {'seed': 1, 'settings': settings, 'evaluation': {'distance': distance}}
+            entry = {'seed': seed, 'settings': settings, 'evaluation': {'distance': distance}}
             other = dataclasses.replace(policy, info={'samples': samples})
             run = train_all.Run(entry, other, '', 1.0)
-            out = output(lambda: train_all.enter(id_, 1, run, **options))
+            out = output(lambda: train_all.enter(id_, seed, run, **options))
             return policies.load(self.folder / f'{id_}.npz').info['samples'], out
 
         with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
@@ -284,6 +284,24 @@ class JobsTest(FolderTest):
             self.assertIn('distance is 3.000, and 100.000 with the shipped policy', out)
             self.assertEqual(enter(2e6, 90.0)[0], 2e6)  # the same run again
             self.assertEqual(enter(100.0, 3.0, overwrite=True)[0], 100)
+
+    def test_the_policy_of_the_run_that_is_named_is_shipped(self):
+        """Also while better runs, whose policies are not stored, are repeated with lower scores."""
+        id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
+        policy, settings = policies.reference(id_), train_all.settings(id_)
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(train_all.evaluation, 'evaluate', return_value={}),
+        ):
+            for seed, distance in ((1, 90), (2, 88), (3, 86), (1, 80), (2, 85), (3, 84)):
+                entry = {'seed': seed, 'settings': settings, 'evaluation': {'distance': distance}}
+                run = train_all.Run(
+                    entry, dataclasses.replace(policy, info={'m': distance}), '', 1.0
+                )
+                train_all.enter(id_, seed, run, overwrite=True)
+                named = train_all.shipped(runs.read(f'{id_}.json'))['evaluation']['distance']
+                self.assertEqual(policies.load(self.folder / f'{id_}.npz').info['m'], named)
+            self.assertEqual((named, len(runs.read(f'{id_}.json')['runs'])), (85, 3))
 
     def test_a_policy_that_others_use_is_kept(self):
         for id_ in 'abcd':
@@ -418,12 +436,20 @@ class FootstepsTest(parameterized.TestCase):
     )
     def test_it_lands_on_its_plan(self, condition, error):
         id_ = evaluate_footsteps.ID
-        found = evaluate_footsteps.run(
-            evaluate_footsteps.row_for(id_, None), policies.reference(id_), 6, 1, 5.0,
-            **evaluate_footsteps.CONDITIONS[condition],
-        )  # fmt: skip
+        row, options = evaluate_footsteps.under(id_, condition)
+        found = evaluate_footsteps.run(row, policies.reference(id_), 6, 1, 5.0, **options)
         self.assertEqual(found['survived'], 1.0)
         self.assertLess(found['landing'], error)
+
+    @parameterized.parameters(
+        ('PD_Biped3D_LLC_InPlace_Step-v0', 'pushes of 150 N', {'length': (0.0, 0.1), 'sharp': 0.0}),
+        ('PD_Biped3D_LLC_Stand_Step-v0', 'general', {'stop': 0.0}),
+        ('PD_Biped3D_LLC_Stand_Step-v0', 'stops', {'stop': 0.1}),
+    )
+    def test_a_condition_keeps_the_plans_of_the_environment(self, id_, condition, plans):
+        row, options = evaluate_footsteps.under(id_, condition)
+        self.assertNotIn('plans', row.options)
+        self.assertContainsSubset(plans.items(), options['plans'].items())
 
 
 class PlannerTransferTest(absltest.TestCase):
