@@ -41,7 +41,6 @@ RANDOM_STEPS = 45
 PERTURBATION = 0.01  # rad
 AMPLITUDE = 0.5  # of the smooth action sequences
 FREQUENCIES = (0.5, 2.0)  # Hz
-GRAVITY = 9.81
 ON_TERRAIN = 3.0  # m; where episodes over terrain begin, beyond the flat start
 REACH = 0.6  # m to both sides of the root that must be clear of the ground there
 RESAMPLES = 1000  # of the bootstrap
@@ -112,7 +111,7 @@ class Subject:
         self.joint_qpos, self.joint_dof = figure.pose_qpos[3:], figure.pose_dof[3:]
         self.root_qpos, self.z_dof = figure.pose_qpos[:2], figure.pose_dof[1]
         body = self.model.dof_bodyid[figure.pose_dof[0]]
-        self.weight = GRAVITY * self.model.body_subtreemass[body]
+        self.weight = -self.model.opt.gravity[2] * self.model.body_subtreemass[body]
         body_of = self.model.geom_bodyid
         self.ground = self.model.body_rootid[body_of] != self.model.body_rootid[body]
         ids = self.model.dof_jntid[self.joint_dof]

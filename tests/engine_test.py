@@ -3,7 +3,7 @@
 import pathlib
 import tempfile
 import threading
-import unittest.mock
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -13,6 +13,7 @@ from dm_control import mjcf
 from trl_suite import engine
 from trl_suite.engine import BatchWorld, PhysicsWorld, native
 from trl_suite.engine.world import CHUNKS, LEAST, READABLE, STATE, WRITABLE
+from trl_suite.util import machine
 
 # A hopper on a box, driven by servos and a muscle, a belt that is moved, and a ball.
 XML = """
@@ -206,7 +207,7 @@ class LibraryTest(parameterized.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / '__init__.py')
             with (
-                unittest.mock.patch.object(mujoco, '__file__', file),
+                mock.patch.object(mujoco, '__file__', file),
                 self.assertRaisesRegex(ImportError, f'no MuJoCo library .* in {folder}; install'),
             ):
                 native.library.__wrapped__()
@@ -219,7 +220,7 @@ class LibraryTest(parameterized.TestCase):
         for each in found:
             floor = each.geom('floor')
             floor.pos, floor.quat, floor.size = pose[:3], pose[3:] / np.linalg.norm(pose[3:]), size
-        with unittest.mock.patch.object(mujoco, '__version__', version):
+        with mock.patch.object(mujoco, '__version__', version):
             native.set_bounds.__wrapped__()(found[0], mujoco.MjData(found[0]))
         mujoco.mj_setConst(found[1], mujoco.MjData(found[1]))
         for name in dir(found[0]):
@@ -250,6 +251,13 @@ class ShareTest(parameterized.TestCase):
             lambda part: parts.append((part.tolist(), threading.get_ident())), np.arange(count)
         )
         self.assertEqual(parts, [(list(range(count)), threading.get_ident())])
+
+    def test_zero_threads_are_all_usable_cores(self):
+        with mock.patch.object(machine, 'cores', return_value=3):
+            world = self.world(0)
+        parts = []
+        world.share(parts.append, world.all_ids)
+        self.assertLen(parts, min(3 * CHUNKS, world.n // LEAST))
 
     def test_other_parts_finish_before_an_error_is_raised(self):
         world, done, go = self.world(), [], threading.Event()

@@ -14,7 +14,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import os
 import pathlib
 import platform
 import re
@@ -26,6 +25,7 @@ import torch
 
 from trl_suite import suite
 from trl_suite.util import files, resources
+from trl_suite.util.machine import cores
 from trl_suite.util.options import checked
 
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
@@ -180,7 +180,7 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
 
 def machine() -> str:
     """Returns a description of this machine for results."""
-    return f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}'
+    return f'{cores()} cores, {platform.machine()}, {platform.system()}'
 
 
 def place(name: str) -> pathlib.Path:

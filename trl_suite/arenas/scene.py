@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 from dm_control import mjcf
 
+from trl_suite.engine import GRAVITY
+
 Colour = tuple[float, float, float]
 CONTACTS = {  # of geoms of the ground
     'friction': (
@@ -63,7 +65,7 @@ def prepare(root: mjcf.RootElement, look: Look = OLIVE) -> None:
     root.option.cone = 'pyramidal'
     root.option.noslip_iterations = 0
     root.option.integrator = 'implicitfast'
-    root.option.gravity = (0, 0, -9.8)
+    root.option.gravity = (0, 0, -GRAVITY)
     root.compiler.boundmass = 0
     root.compiler.boundinertia = 0
     # Sky and light cost so little that one model is used for both physics and rendering.

@@ -46,6 +46,7 @@ from trl_suite.characters.model_file import (
     turned,
 )
 from trl_suite.characters.specs import CHARACTERS
+from trl_suite.engine import native
 from trl_suite.motion import quaternion
 from trl_suite.util import errors, limited
 from trl_suite.util.files import check_size, existing
@@ -54,9 +55,6 @@ from trl_suite.util.options import checked
 Names = Collection[str] | None
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
-_DIVERGED = [
-    int(getattr(mujoco.mjtWarning, f'mjWARN_BADQ{kind}')) for kind in ('POS', 'VEL', 'ACC')
-]
 SOFT = (0.02, 1.0)  # MuJoCo's default for joint limits: not the choice of the file's author
 CAMERA_AWAY = 3.2  # distance of cameras, in reaches of the character
 
@@ -231,7 +229,7 @@ def _check_physics(spec: CharacterSpec) -> None:
         value = getattr(model, name)
         if isinstance(value, np.ndarray) and not np.isfinite(value).all():
             raise ValueError(f'{name} has a value that is not finite; expected smaller numbers')
-    if data.warning.number[_DIVERGED].any():
+    if data.warning.number[slice(*native.BAD)].any():
         raise ValueError('its simulation diverges in the first step; expected a stable one')
 
 

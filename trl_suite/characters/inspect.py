@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from trl_suite.characters.character import Joint
+from trl_suite.engine import GRAVITY
 from trl_suite.util import errors
 
-GRAVITY = 9.8  # m/s^2, of the arenas
 SLIDE_WEIGHTS = 2.0  # force limit of a slide, in weights of the character
 KD_SHARE = 0.1  # s; kd per kp
 ARMATURE_SHARE = 0.01 / 300  # s^2; armature per kp

@@ -170,13 +170,8 @@ def shipped_policies() -> Finding:
 
 def cores() -> Finding:
     """The useful number of threads."""
-    usable, all_ = machine.cores(), os.cpu_count() or 1
-    text = f'{usable} of {all_} cores usable, {machine.processor()}'
-    if usable == all_:
-        return Finding(OK, f'{text}; num_threads=0 starts as many threads')
-    return Finding(
-        NOTE, text, f'num_threads=0 starts {all_} threads; pass num_threads={usable} instead'
-    )
+    text = f'{machine.cores()} of {os.cpu_count()} cores usable, {machine.processor()}'
+    return Finding(OK, f'{text}; num_threads=0 starts as many threads')
 
 
 def compiled_code() -> Finding:

@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trl_suite.characters import Character
-from trl_suite.engine import World
+from trl_suite.engine import GRAVITY, World
 from trl_suite.util.compiled import compiled, compiled_inline
-
-GRAVITY = 9.8  # m/s^2
 
 
 class Skeleton(NamedTuple):

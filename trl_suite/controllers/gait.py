@@ -21,7 +21,7 @@ from trl_suite.controllers import dynamics, parameters
 from trl_suite.controllers.dynamics import Mechanics
 from trl_suite.controllers.gaits import STATES, GaitData, GaitState, Machine, Scratch
 from trl_suite.controllers.parameters import KINDS, Parameters
-from trl_suite.engine import World
+from trl_suite.engine import GRAVITY, World
 from trl_suite.util import errors
 
 _LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift supports, in addition to the root
@@ -99,8 +99,7 @@ class Gait:
             constant=constant,
             contact=int(contacts[0]),
             holds_weight=gait.gravity_compensation,
-            lift=-(float(world.models[0].body_mass[skeleton.links[0]]) + _LEG_ON_GROUND)
-            * dynamics.GRAVITY,
+            lift=-(float(world.models[0].body_mass[skeleton.links[0]]) + _LEG_ON_GROUND) * GRAVITY,
         )
         n, size, count = world.n, len(skeleton.dof), len(self.number)
         vector, angles = gait.action_offset, np.zeros(count)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import copy
-import os
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.engine import motors, native, pushes
+from trl_suite.util import machine
 from trl_suite.util.compiled import address, packed
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
@@ -28,6 +28,7 @@ WRITABLE = (
 # Fields that every task reads. A batch copies its fields after every step: others are optional.
 READABLE = ('xpos', 'xipos', 'cvel', 'subtree_com', 'sensordata', 'ten_length')
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # restores a trajectory bit for bit
+GRAVITY = 9.8  # m/s^2, of all arenas
 CHUNKS = 4  # parts per thread into which env_ids are split, since some take longer than others
 LEAST = 4  # simulations per part
 
@@ -197,10 +198,6 @@ class World:
         mujoco.mj_forward(model, data)
         native.physics_to_arrays(self.all_ids[env_id], self.pack)  # not a negative index
 
-    def diverged(self) -> np.ndarray:
-        """Returns which simulations have had a non-finite or huge state since their reset, (n,)."""
-        return np.array([data.warning.number[slice(*native.BAD)].any() for data in self._data])
-
     @property
     def time(self) -> np.ndarray:
         """Simulated time since the reset of each simulation, (n,) s."""
@@ -307,11 +304,11 @@ class BatchWorld(World):
         Args:
           model: copied once per simulation, so it should be small; see `light_model`.
           n: number of simulations.
-          num_threads: threads that step them; 0 uses all cores.
+          num_threads: threads that step them; 0 for all cores that this process may use.
           fields: further fields of MjData, in addition to `WRITABLE` and `READABLE`.
         """
         models = [copy.copy(model) for _ in range(n)]
-        threads = num_threads or os.cpu_count() or 1
+        threads = num_threads or machine.cores()
         super().__init__(models, [mujoco.MjData(each) for each in models], fields, False, threads)
         self.reset(self.all_ids)
 

@@ -15,7 +15,7 @@ from trl_suite.bodies.blocks import Block, Noise, columns
 from trl_suite.bodies.body import Measurement, Travel, write_distance
 from trl_suite.bodies.reference import link_extents
 from trl_suite.characters import Character
-from trl_suite.engine import World
+from trl_suite.engine import GRAVITY, World
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.common.control import (
@@ -31,7 +31,6 @@ from trl_suite.tasks.tracking import BodyTask
 from trl_suite.util.compiled import compiled
 
 FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
-GRAVITY = 9.8  # m/s^2
 
 
 class WalkData(NamedTuple):
