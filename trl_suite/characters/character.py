@@ -239,9 +239,9 @@ class Character(composer.Entity):
     def _find(self, namespace: str, name: str) -> mjcf.Element:
         element = self._mjcf_root.find(namespace, name)
         if element is None:
+            file = f'xml/{self.spec.name}.xml' if self.spec.xml is None else 'its XML'
             raise ValueError(
-                f'character {self.spec.name!r}: xml/{self.spec.name}.xml has no {namespace} named '
-                f'{name!r}'
+                f'character {self.spec.name!r}: {file} has no {namespace} named {name!r}'
             )
         return element
 

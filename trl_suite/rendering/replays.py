@@ -58,7 +58,11 @@ class Replay:
 
     def __enter__(self) -> Replay:
         self._server = web_server.start_server('127.0.0.1', 0)
-        self._scene = web_scene.WebScene(self._server, self._environment)
+        try:
+            self._scene = web_scene.WebScene(self._server, self._environment)
+        except BaseException:
+            self._server.stop()
+            raise
         return self
 
     def add(self, jump: bool = False) -> None:

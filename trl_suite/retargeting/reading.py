@@ -30,7 +30,7 @@ def read(
       path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL or DeepTerrainRL, with the character's joints in
         its order, or of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save`
         (.npz).
-      character: the character of a file of the first two; other formats ignore it.
+      character: whose joints a JSON of TerrainRL or DeepTerrainRL has; other formats ignore it.
       skeleton: the .asf file that belongs to an Acclaim file; None for other formats.
       **options: of `motion.read_bvh` or `motion.read_amc`.
 

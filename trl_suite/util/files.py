@@ -218,7 +218,11 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
                 raise RuntimeError(f'process {file.read().strip() or "?"} {what}') from None
             except OSError:
                 pass  # the file system has no locks
-            if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
+            try:
+                same = os.path.samestat(os.stat(path), os.fstat(file.fileno()))
+            except FileNotFoundError:
+                same = False
+            if not same:
                 continue  # the process that had the lock has just removed this file
             file.truncate(0)
             file.write(f'{os.getpid()}\n')
