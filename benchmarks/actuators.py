@@ -309,13 +309,10 @@ def page() -> None:
         parts['costs'] = cost_table(found['costs'])
     if 'effects' in found:
         parts['effects'] = effect_table(found['effects'])
-    text = PAGE.read_text(encoding='utf-8')
     for name, part in parts.items():
-        begin, end = f'<!-- actuators: {name} -->\n', '<!-- end -->'
-        before, rest = text.split(begin)
-        text = before + begin + '\n' + part.strip() + '\n\n' + end + rest.split(end, 1)[1]
-    with files.replacing(PAGE) as path:
-        path.write_text(text, encoding='utf-8')
+        files.replace_between(
+            PAGE, f'<!-- actuators: {name} -->', '<!-- end -->', f'\n{part.strip()}\n'
+        )
 
 
 if __name__ == '__main__':

@@ -64,7 +64,7 @@ def steps(n=7):
                 [speed * times, 0.1 * times, 1 + 0 * times, turn, turn, times, still, 0 * times]
             )
         )
-    return motion.Steps(
+    return motion.FootstepLibrary(
         'steps',
         times,
         np.array(poses),

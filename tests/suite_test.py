@@ -43,8 +43,8 @@ UNKNOWN = (
     (lambda: suite.build('dog', clip='dog_bond'), "unknown clip 'dog_bond'.*'dog_bound'"),
 )  # fmt: skip
 OTHER_TYPES = (
-    (lambda: suite.combine(None), 'a character is a CharacterSpec or a name, one of dog.*not None'),
-    (lambda: suite.build(3), 'a character is'), (lambda: suite.make(None), 'the id .* not None'),
+    (lambda: suite.combine(None), 'character is None; expected a name, or what characters.from_file'),
+    (lambda: suite.build(3), 'character is'), (lambda: suite.make(None), 'the id .* not None'),
     (lambda: suite.make([]), 'the id of an environment is a string'),
     (lambda: suite.build('dog', clip=3), 'clip is a name, a file, a Clip or FootstepLibrary, not 3'),
     (lambda: suite.make(GAPS, 3), 'task_kwargs is 3; expected a dict'),

@@ -156,8 +156,7 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
         environment is unknown or has no gait.
     """
     s = settings
-    if s.changes not in CHANGES:
-        raise ValueError(errors.unknown('kind of changes', s.changes, CHANGES))
+    errors.check_known('kind of changes', CHANGES, s.changes)
     if s.first.actors:
         raise ValueError(
             f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"

@@ -148,17 +148,8 @@ def combine(
     Raises:
       ValueError: unknown names, or parts that are incompatible.
     """
-    own: dict[str, Any] = {}
-    if isinstance(character, characters.CharacterSpec):
-        own['character'], figure = character, character
-    elif isinstance(character, str):
-        errors.check_known('character', characters.CHARACTERS, character)
-        figure = characters.CHARACTERS[character]
-    else:
-        raise TypeError(
-            f'a character is a CharacterSpec or a name, one of {", ".join(characters.CHARACTERS)}; '
-            f'not {character!r}'
-        )
+    figure = characters.spec_of(character)
+    own: dict[str, Any] = {} if isinstance(character, str) else {'character': character}
     if not isinstance(clip, (str, motion.Clip, motion.FootstepLibrary, type(None))):
         raise TypeError(f'clip is a name, a file, a Clip or FootstepLibrary, not {clip!r}')
     type_ = _type(task, figure)

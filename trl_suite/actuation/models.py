@@ -297,6 +297,5 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
     Raises:
       ValueError: unknown model, a character without muscles, or invalid options.
     """
-    if model not in _MODELS:
-        raise ValueError(errors.unknown('actuation', model, ACTUATIONS))
+    errors.check_known('actuation', ACTUATIONS, model)
     return _MODELS[model](character, timestep, **options)

@@ -198,13 +198,12 @@ class SpatialArena(composer.Arena):
         random: Random,
         root: npt.ArrayLike,
         rule: str = 'far',
-        distance: float = 1.0,
     ) -> np.ndarray:
         """Draws a goal for one simulation, clear of boxes at present; see `SpatialGround.goal`."""
         ground, centres = self.grounds[env_id], self.seen(env_id).centres(np.array([env_id]))[0]
         assert ground is not None
         movers = ground.layout.movers and centres[: len(ground.layout.movers.speed)]
-        return ground.goal(random, root, rule, distance=distance, movers=movers)
+        return ground.goal(random, root, rule, movers)
 
     def state(self, env_id: int) -> dict[str, Any]:
         """Returns the state from which `restore` restores the ground of one simulation exactly."""

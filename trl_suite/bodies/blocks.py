@@ -15,11 +15,9 @@ import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.characters import Character
+from trl_suite.motion.layout import SPIN
 
 LEVELS = ('mild', 'robot', 'harsh')  # presets of sensors
-# Signs of a reflected vector, of a quaternion, and of a pseudovector such as an angular velocity.
-VECTOR, QUATERNION, SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
-
 ANGLE_AXIS = (1.0, -1.0, -1.0, 1.0)  # angle; forward, up, right
 
 

@@ -10,20 +10,12 @@ import numpy as np
 
 from trl_suite.actuation.action_map import drive
 from trl_suite.arenas import SpatialArena
-from trl_suite.bodies.blocks import (
-    HEIGHTS,
-    PLACES,
-    QUATERNION,
-    SPEEDS,
-    SPIN,
-    VECTOR,
-    Block,
-    Reflection,
-)
+from trl_suite.bodies.blocks import HEIGHTS, PLACES, SPEEDS, Block, Reflection
 from trl_suite.bodies.body import CLEARANCE, MAX_JOINT_SPEED, Body, BodyData, feature_columns
 from trl_suite.characters import Character
 from trl_suite.engine import native
 from trl_suite.motion import quaternion
+from trl_suite.motion.layout import QUATERNION, SPIN, VECTOR
 from trl_suite.policies.mirror import blocks as mirrored_blocks
 from trl_suite.policies.mirror import exchanged
 from trl_suite.terrain.spatial import windows as spatial_ground

@@ -31,8 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
         if value is None:
             continue
         known = {item for spec in catalogue.SPECS for item in _values(spec, name)}
-        if value not in known:
-            raise ValueError(errors.unknown(name, value, known))
+        errors.check_known(name, known, value)
         chosen = [row for row in chosen if value in _values(row, name)]
     if arguments.trained:
         shipped = policies.available()

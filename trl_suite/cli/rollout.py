@@ -21,7 +21,7 @@ from trl_suite.cli.arguments import (
     valid,
 )
 from trl_suite.environments import named_policies as acting
-from trl_suite.util import files, tables
+from trl_suite.util import archive, tables
 
 if TYPE_CHECKING:
     import dm_env
@@ -108,10 +108,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
     if arguments.trajectory is not None:
-        with files.replacing(arguments.trajectory) as part:
-            np.savez_compressed(
-                part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
-            )
+        id_ = suite.find(arguments.id).id
+        archive.write(arguments.trajectory, {**record.arrays(), 'seed': arguments.seed, 'id': id_})
     print(record.summary())
     for path in (arguments.video, arguments.html, arguments.strip, arguments.trajectory):
         if path is not None:

@@ -109,8 +109,7 @@ class VectorEnvironment:
         """
         checked('num_envs', num_envs, int, at_least=1, at_most=MOST_ENVS)
         checked('num_threads', num_threads, int, at_least=0, at_most=MOST_THREADS)
-        if autoreset not in AUTORESET:
-            raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
+        errors.check_known('autoreset', AUTORESET, autoreset)
         checked('flat_observation', flat_observation, bool)
         self.spec, self.dtype = spec_of(environment), arguments.check_dtype(dtype)
         self.num_envs, self.autoreset = int(num_envs), autoreset

@@ -9,8 +9,6 @@ from trl_suite.motion.steps import features as step_features
 from trl_suite.motion.steps import load as load_steps
 from trl_suite.motion.steps import names as steps_names
 
-Steps = FootstepLibrary  # as programs of users may call it
-
 __all__ = [
     'DOG3D',
     'HUMANOID3D',

@@ -14,9 +14,8 @@ ROOT_SIZES = {'planar': 3, 'free': 7}  # columns of a pose: x, z, pitch; x, y, z
 LARGEST = 1e6  # m, rad or s; larger values in a motion are errors, and their squares may overflow
 SHORTEST = 1e-6  # s; least time between two frames, by which differences are divided
 JOINT_SIZES = (1, 4)  # hinge angle; ball-joint quaternion
-_REFLECTED_QUATERNION = (1, -1, 1, -1)
-_REFLECTED_POSITION = (1, -1, 1)
-_REFLECTED_TURN = (-1, 1, -1)  # angular velocity
+# Signs of a reflected vector, of a quaternion, and of a pseudovector such as an angular velocity.
+VECTOR, QUATERNION, SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
 
 
 class Layout:
@@ -125,10 +124,10 @@ class Mirror:
         self._pose_source, self._rate_source = np.arange(layout.columns), np.arange(layout.rates)
         self._pose_sign, self._rate_sign = np.ones(layout.columns), np.ones(layout.rates)
         if layout.root == 'free':
-            self._pose_sign[:3] = self._rate_sign[:3] = _REFLECTED_POSITION
+            self._pose_sign[:3] = self._rate_sign[:3] = VECTOR
         for q, v in layout.rotations:
-            self._pose_sign[q : q + 4] = _REFLECTED_QUATERNION
-            self._rate_sign[v : v + 3] = _REFLECTED_TURN
+            self._pose_sign[q : q + 4] = QUATERNION
+            self._rate_sign[v : v + 3] = SPIN
         for pair in pairs:
             (q0, v0), (q1, v1) = map(layout.starts, pair)
             size, other = (layout.sizes[layout.joints.index(joint)] for joint in pair)

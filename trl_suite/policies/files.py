@@ -29,7 +29,7 @@ from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Policy
 from trl_suite.util import archive, errors, resources
 from trl_suite.util.archive import take
-from trl_suite.util.files import check_path, existing, replacing
+from trl_suite.util.files import check_path, existing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
@@ -78,10 +78,8 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
         fields['layer_norm'] = 1
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
     fields |= {name: value for name, value in optional.items() if value is not None}
-    with replacing(check_path(path, ('.npz',))) as part:
-        np.savez_compressed(
-            part, allow_pickle=False, **{name: _small(value) for name, value in fields.items()}
-        )
+    small = {name: _small(value) for name, value in fields.items()}
+    archive.write(check_path(path, ('.npz',)), small)
 
 
 def load(path: str | os.PathLike[str]) -> Policy:
@@ -209,8 +207,7 @@ def _source(id: str, variant: str = '') -> tuple[str, float]:
 
 def _folder(variant: str) -> pathlib.Path:
     """Returns the folder of the policies of a variant, or of '', the policies themselves."""
-    if variant and variant not in VARIANTS:
-        raise ValueError(errors.unknown('variant of policies', variant, VARIANTS))
+    errors.check_known('variant of policies', ('', *VARIANTS), variant)
     return resources.directory('trained') / variant
 
 

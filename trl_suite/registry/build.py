@@ -32,8 +32,7 @@ def task_type(spec: EnvSpec) -> TaskType | None:
 
 def character_of(spec: EnvSpec) -> characters.CharacterSpec:
     """Returns the spec of an environment's character."""
-    character = spec.part('character')
-    return characters.CHARACTERS[character] if isinstance(character, str) else character
+    return characters.spec_of(spec.part('character'))
 
 
 def config_of(spec: EnvSpec) -> type[Config] | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.actuation import character_muscles
+from trl_suite.actuation.models import original_ranges
 from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.bodies.reference import joint_targets, mean_targets
 from trl_suite.bodies.spatial import MAPS
@@ -241,17 +242,8 @@ def joint_options(
 
 def _original(character: Character) -> dict[str, Any]:
     """Returns action_offset and action_scale of the original in the plane, rad."""
-    ranges = np.array(
-        [
-            joint.original_range or limits
-            for joint, limits in zip(
-                character.spec.joints.values(), character.joint_ranges.tolist(), strict=True
-            )
-        ]
-    )
-    free = ~np.isfinite(ranges).all(1)
-    ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
-    return {'action_offset': ranges.mean(1), 'action_scale': 2 * (ranges[:, 1] - ranges[:, 0])}
+    ranges = original_ranges(character)
+    return {'action_offset': ranges.mean(1), 'action_scale': 2 * np.ptp(ranges, axis=1)}
 
 
 def start_phases(option: float | Sequence[Sequence[float]] | None) -> Callable[[float], float]:

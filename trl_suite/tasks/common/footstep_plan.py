@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.bodies.blocks import VECTOR, Block, Noise, Reflection
+from trl_suite.bodies.blocks import Block, Noise, Reflection
 from trl_suite.bodies.body import Measurement, ahead_and_left
 from trl_suite.bodies.state import FLAG, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.motion import FootstepLibrary
+from trl_suite.motion.layout import VECTOR
 from trl_suite.tasks.rewards import wrapped
 from trl_suite.tasks.task import Marker
 from trl_suite.util.compiled import compiled

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.arenas import SpatialArena
-from trl_suite.bodies.blocks import SPIN, VECTOR, Block, Noise, signs
+from trl_suite.bodies.blocks import Block, Noise, signs
 from trl_suite.bodies.body import Measurement, ahead_and_left, polar
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.bodies.spatial import SpatialState
 from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE, allocated
 from trl_suite.engine import World
+from trl_suite.motion.layout import SPIN, VECTOR
 from trl_suite.tasks.rewards import Outcome, Term, give, terms_data
 from trl_suite.tasks.task import Marker, random_displacement
 from trl_suite.tasks.tracking import BodyTask

@@ -23,6 +23,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import GAIT_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
+from trl_suite.policies.mirror import exchanged
 from trl_suite.tasks.common.control import MOST_SUBSTEPS, GroundConfig, faces, flat_ground
 from trl_suite.tasks.gait import rules
 from trl_suite.tasks.rewards import terms_data
@@ -182,15 +183,13 @@ class GaitTask(Task):
     def _sources(self) -> np.ndarray:
         """Returns the columns of the body's blocks that are observed, by stance leg, (2, size)."""
         links, body = self.character.spec.links, self.body.data.columns
-        order = np.arange(len(links))
-        mirrored = order.copy()
-        for right, left in self.character.spec.mirror:
-            i, j = links.index(right), links.index(left)
-            mirrored[i], mirrored[j] = j, i
+        pairs = [
+            (links.index(right), links.index(left)) for right, left in self.character.spec.mirror
+        ]
         arranged = []
-        for each in (order, mirrored):
-            pairs = 2 * each[:, None] + np.arange(2)
-            pose, velocity = pairs[1:] + body.pose + 1, pairs + body.velocity
+        for each in (np.arange(len(links)), exchanged(len(links), pairs)):
+            columns = 2 * each[:, None] + np.arange(2)
+            pose, velocity = columns[1:] + body.pose + 1, columns + body.velocity
             terrain = np.arange(rules.SAMPLES) + body.terrain
             parts = terrain, [body.pose], pose.ravel(), velocity.ravel()
             arranged.append(np.concatenate(parts))

@@ -19,7 +19,8 @@ TRAIL_SPAN = 40.0  # m; characters start on a trail within a square of this half
 TRAIL_PAD = 1.0  # m; distance of these starts from the rim of the square
 TRAIL_OFFSET = 0.4  # of the width; largest lateral distance of goals from the middle of a trail
 START_ROOM = 1.0  # m; half side of the square around a start that must be clear
-GOAL_SPREAD = 3.0  # m
+GOAL_SPREAD = 3.0  # m; largest distance of a goal along x and along y
+LEAST_AHEAD = 1.0  # m; least distance of a goal that is straight ahead
 TRIES = 1000  # places tried before the origin is used
 FAR_APART, AREA = 1e3, 1e5  # m, m^2; points with a larger spread are queried one by one
 RULES = ('far', 'near')
@@ -168,14 +169,12 @@ class SpatialGround:
         random: Random,
         root: npt.ArrayLike,
         rule: str = 'far',
-        *,
-        distance: float = 1.0,
         movers: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draws a goal on the ground.
 
         The position depends on the layout's place: near the character (rule `far`: within 3 m along
-        x and along y; `near`: from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a
+        x and along y; `near`: 1 to 3 m ahead along x, at y = 0); anywhere clear, as a
         start; or on the trail, 1 to 10 segments of 2 m beyond the one nearest to the character
         (`near`: 1 segment).
 
@@ -183,7 +182,6 @@ class SpatialGround:
           random: source of randomness.
           root: position of the character, (2,) m.
           rule: one of `RULES`.
-          distance: smallest distance of a goal for the rule `near`, m.
           movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
 
         Returns:
@@ -217,7 +215,7 @@ class SpatialGround:
         elif rule == 'far':
             x, y = root + [random.uniform(-GOAL_SPREAD, GOAL_SPREAD) for _ in range(2)]
         else:
-            x, y = root[0] + random.uniform(distance, GOAL_SPREAD), 0.0
+            x, y = root[0] + random.uniform(LEAST_AHEAD, GOAL_SPREAD), 0.0
         height = float(self.height(x, y, movers))
         return np.array([x, y, height if math.isfinite(height) else 0.0])  # beyond the ground
 
