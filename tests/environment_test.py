@@ -432,6 +432,8 @@ class HookTest(parameterized.TestCase):
         environment = Environment(self.task())
         with self.assertRaisesRegex(ValueError, f'{hook} hook'):
             environment.add_extra_hook(hook, lambda *_: None)
+        with self.assertRaisesRegex(RuntimeError, 'compiled; set time steps before .* substeps'):
+            environment.task.set_timesteps(0.02, 0.001)
 
     def test_other_hooks_run(self):
         environment, calls = Environment(self.task(), random=0), []

@@ -131,6 +131,11 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual(found['normalized_return'], found['return'] / 3)
         self.assertGreater(found['normalized_return'], 0.3)
 
+    def test_a_time_limit_counts_as_its_steps(self):
+        found = evaluation.evaluate(GAPS, make(GAPS), 4, task_kwargs={'time_limit': 0.1})
+        self.assertEqual((found['step_limit'], found['lengths']), (3, [3] * 4))
+        self.assertEqual(found['normalized_return'], found['return'] / 3)
+
     def test_a_fall_in_the_last_step_is_not_full_length(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 3, factory=True)
         spec = dataclasses.replace(suite.find(FLAT), step_limit=found['lengths'][0])

@@ -371,6 +371,10 @@ class CharacterTest(WrittenTest):
             (lambda: self.planar(MJCF.replace('<geom size=".15', f'<geom contype="{2**30}" size=".15')),
              f"geom 'trunk_geom0' has contype {2**30}"),
             (lambda: self.urdf(spatial=None), 'spatial=True or spatial=False'),
+            (lambda: characters.make(self.planar(joints={'left_hip': characters.Joint(40, 1, 1, target=45)})),
+             "target of 'left_hip' is 45; expected .* its limits"),
+            (lambda: self.urdf(URDF.replace('lower="-0.7"', 'lower="0.7"')),
+             'limits 0.7 to 0.4; expected the lower first'),
             (lambda: characters.from_file('robot.usd', **TWO), 'expected .xml or .mjcf or .urdf'),
         )  # fmt: skip
         assert_refused(
@@ -399,6 +403,9 @@ class CharacterTest(WrittenTest):
             ('', '', {**free, 'turn': (0.7071, 0, 0, -0.7071)},
              'it may face .0.1, -1.0., according to its left and right bodies'),
             ('', '', free, 'spatial=True was given .* two slides and a hinge'),
+            ('<mujoco>', '<mujoco><option gravity="0 0 -3.7"/>', {}, r'gravity of the file, .*-3.7.* is left out'),
+            ('</worldbody>', '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody>', {'root': 'trunk'},
+             'bodies beside the character are left out: ball'),
         ):  # fmt: skip
             self.assertIn(before, MJCF)
             self.assertNotRegex(plain, note)
@@ -457,7 +464,7 @@ class CharacterTest(WrittenTest):
         ('nan', 'name="left_knee" axis', 'name="left_knee" armature="nan" axis', 'armature="nan" of .left_knee. .<joint>.; expected finite'),
         ('infinity', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="0 0 inf"', 'line 1: pos="0 0 inf" of .trunk.'),
         ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
-        ('no_size', 'size=".15 .15 .2"', 'size=".15 0 .2"', "geom 'trunk_geom0': a size is 0; expected positive sizes"),
+        ('no_size', 'size=".15 .15 .2"', 'size=".15 0 .2"', "geom 'trunk_geom0': a size is 0 or negative; expected positive sizes"),
         ('copies', '<geom type="capsule"', '<replicate count="60"><replicate count="60"><geom size="1"/></replicate></replicate><geom type="capsule"', 'bodies, joints, geoms and sites are 144[0-9][0-9]; expected no more than 10000'),
         ('many', '<geom type="capsule"', 2501 * '<geom size="1"/>' + '<geom type="capsule"', 'geoms and sites are 100[0-9][0-9]; expected no more'),
         ('flex', '<geom size=".15', '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" name="cloth" rigid="true"/><geom size=".15', "flex 'cloth': flexible bodies are not supported, .*; remove it, or replace it by geoms"),
@@ -724,6 +731,8 @@ class TerrainTest(WrittenTest):
             (lambda: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
             (lambda: terrain.from_heights([0, np.nan], 1), r'heights: nan at \[1\]; expected finite'),
             (lambda: terrain.from_heights([0, 0], 0), 'spacing is 0'),
+            (lambda: terrain.from_heights(np.zeros((9, 5)), 0.5, line=1.1), 'line is 1.1; expected .*1'),
+            (lambda: terrain.load('var2d_gaps'), "is a type of terrain; expected {'Type': 'var2d_gaps'}"),
             (lambda: terrain.from_mesh('hill.fbx'), "suffix '.fbx'; expected .obj or"),
             (lambda: terrain.from_mesh(f / 'away.stl'), 'not over the origin'),
             (lambda: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
@@ -751,15 +760,30 @@ class TerrainTest(WrittenTest):
         )
 
     def test_a_rerun_cell_replaces_its_terrain(self):
-        def heights(factor):
-            def wavelets(x):
+        def cell(factor):
+            names = {'np': np, '__name__': '__main__'}
+            exec(f'def wavelets(x): return {factor} * np.sin(x)', names)
+            return terrain.from_function(names['wavelets'])
+
+        cell(1.0)
+        again = terrain.PlanarGround(cell(0.5), 0)
+        self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
+
+    def test_functions_of_a_factory_do_not_replace_each_other(self):
+        def made(factor):
+            def ripples(x):
                 return factor * np.sin(x)
 
-            return terrain.from_function(wavelets)
+            return terrain.from_function(ripples)
 
-        heights(1.0)
-        again = terrain.PlanarGround(heights(0.5), 0)
-        self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
+        first = made(1.0)
+        self.assertEqual(made(1.0), first)
+        with self.assertRaisesRegex(
+            ValueError, "'ripples' exists; pass replace=True .* another name"
+        ):
+            made(0.5)
+        heights = terrain.PlanarGround(first, 0).height(np.arange(0, 9, 0.1))
+        self.assertAlmostEqual(np.ptp(heights), 2, delta=0.01)
 
     @parameterized.parameters(
         (terrain.register, lambda parameters, length, rng: None),
@@ -885,9 +909,12 @@ class TaskTest(parameterized.TestCase):
         assert_refused(self, *((lambda o=o: step(o), message) for o, message in (
             ({'rewards': {'a': (1, parts.joint_angles)}}, r"reward 'a' has shape \(1, 11\)"),
             ({'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is not finite"),
-            ({'observations': {'a': (0, parts.speed)}}, 'size 0'),
+            ({'observations': {'a': (-5, parts.speed)}}, 'has size -5; expected a positive integer'),
             ({'observations': {'pose': (1, parts.speed)}}, "already has a block 'pose'"),
             ({'rewards': {'a': parts.speed}}, r'expected \(weight, function\)'),
+            ({'rewards': {'a': (parts.speed, 1.0)}}, "reward 'a' is 1.0; expected a function of the task"),
+            ({'rewards': {'a': (math.inf, parts.speed)}}, "reward 'a' has weight inf; expected a finite number"),
+            ({'rewards': {'pose': (1, parts.speed)}}, "already has a reward term 'pose'"),
             ({'failures': {'a': 1}}, 'expected a function'),
             ({'rewards': [1]}, 'expected a dict'), ({'reward': {}}, "did you mean 'rewards'"),
         )))  # fmt: skip

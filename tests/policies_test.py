@@ -9,6 +9,7 @@ import pathlib
 import zipfile
 from unittest import mock
 
+import dm_env
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest, assert_refused
@@ -249,6 +250,12 @@ class ActTest(parameterized.TestCase):
     def test_other_observations_are_rejected(self, observation, message):
         with self.assertRaisesRegex(ValueError, message):
             make()(observation)
+
+    def test_a_time_step_is_no_observation(self):
+        with self.assertRaisesRegex(
+            TypeError, r'expected its observation: policy\(time_step.observation\)'
+        ):
+            make()(dm_env.restart({'terrain': np.zeros(3), 'pose': np.zeros(4)}))
 
     def test_a_preferred_default_action(self):
         choices = np.array([[0.5, -0.5], [0, 0], [-1, 0.25]])

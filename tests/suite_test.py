@@ -47,6 +47,7 @@ OTHER_TYPES = (
     (lambda: suite.build(3), 'character is'), (lambda: suite.make(None), 'the id .* not None'),
     (lambda: suite.make([]), 'the id of an environment is a string'),
     (lambda: suite.build('dog', clip=3), 'clip is a name, a file, a Clip or FootstepLibrary, not 3'),
+    (lambda: suite.build('dog', task=lambda *_, **__: None), 'task returned None; expected a Task'),
     (lambda: suite.make(GAPS, 3), 'task_kwargs is 3; expected a dict'),
     (lambda: suite.make(GAPS, None, 'x'), "environment_kwargs is 'x'; expected a dict"),
     (lambda: suite.make(HIGH, {'controller': 3}), 'controller is 3; expected the id of an environment'),

@@ -178,6 +178,9 @@ def _run(
     )
     id_, step_limit = environments.spec.id, environments.step_limit
     try:
+        if environments.time_limit < math.inf and not environments.task.steps_vary:
+            steps = math.ceil(environments.time_limit / environments.control_timestep - 1e-6)
+            step_limit = steps if step_limit is None else min(step_limit, steps)
         if step_limit is None:
             raise ValueError(f'{id_} has no step limit, so its episodes may never end')
         if not callable(policy):

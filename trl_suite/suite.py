@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 try:
     import dm_control
 except ModuleNotFoundError as error:
@@ -150,6 +152,8 @@ def combine(
     """
     figure = characters.spec_of(character)
     own: dict[str, Any] = {} if isinstance(character, str) else {'character': character}
+    if isinstance(clip, os.PathLike):
+        clip = os.fspath(clip)
     if not isinstance(clip, (str, motion.Clip, motion.FootstepLibrary, type(None))):
         raise TypeError(f'clip is a name, a file, a Clip or FootstepLibrary, not {clip!r}')
     type_ = _type(task, figure)

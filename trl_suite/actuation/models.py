@@ -27,6 +27,7 @@ from trl_suite.actuation.action_map import AXIS_OFFSET, ActionMap
 from trl_suite.actuation.muscles import MUSCLES, PLAIN, Muscle, constant_arm, mujoco_parameters
 from trl_suite.characters.character import Character
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 DAMPING_DIVISOR = 50.0  # passive damping of torque and position joints: torque limit / this, in s
 MUSCLE_DAMPING_DIVISOR = 100.0  # less damping, as the force-velocity curve also damps
@@ -298,4 +299,5 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       ValueError: unknown model, a character without muscles, or invalid options.
     """
     errors.check_known('actuation', ACTUATIONS, model)
+    checked('timestep', timestep, float, 's', above=0)
     return _MODELS[model](character, timestep, **options)

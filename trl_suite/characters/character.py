@@ -154,6 +154,12 @@ class Character(composer.Entity):
             self._mjcf_root.model = name
         # Names that the file lacks raise here.
         _ = *self.joints, *self.bodies, *self.end_effectors
+        for (joint, given), (low, high) in zip(spec.joints.items(), self.joint_ranges, strict=True):
+            if np.ndim(given.target) == 0 and not low - 1e-6 <= given.target <= high + 1e-6:
+                raise ValueError(
+                    f'character {spec.name!r}: target of {joint!r} is {given.target:g}; expected {low:g} to '
+                    f'{high:g}, its limits'
+                )
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:

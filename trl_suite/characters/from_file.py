@@ -5,7 +5,7 @@
     environment = suite.build(spec, terrain='hills3d', task='walk')
 
 MuJoCo reads the file, in a process of its own with limited time and memory. Frames are MuJoCo's:
-the character faces +x, z points up. The masses, joint limits, joint damping, position actuators and
+the character faces +x, z points up. The masses, joint limits, position actuators and
 torque limits of the file are kept; missing values are chosen as follows:
 
 * the torque limit of a joint is the torque of the whole character's weight at the farthest end of
@@ -17,7 +17,7 @@ torque limits of the file are kept; missing values are chosen as follows:
 
 `spec.notes` lists these assumptions, and the actuators that were left out: those that act on a
 tendon, a site or a body, because every joint gets its own actuator. The passive damping of joints
-is added to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept, and the
+is added to kd, which torque control does not use (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept, and the
 `solreflimit` of joint limits, if it is not MuJoCo's default: it describes the robot's stops, and MuJoCo
 keeps a time constant stable at any time step. Limits without it are as stiff as the time step permits.
 Sensors, lights, everything outside the character, and tendons and equalities with it are removed.
@@ -46,7 +46,7 @@ from trl_suite.characters.model_file import (
     turned,
 )
 from trl_suite.characters.specs import CHARACTERS
-from trl_suite.engine import native
+from trl_suite.engine import GRAVITY, native
 from trl_suite.motion import quaternion
 from trl_suite.util import errors, limited
 from trl_suite.util.files import check_size, existing
@@ -261,6 +261,19 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         f'{item.tag} {item.name!r} is left out: it ties the character to something else'
         for item in ties
     ]
+    gravity = np.array(spec.option.gravity)
+    if abs(gravity - np.array((0, 0, -GRAVITY))).max() > 0.1:
+        found.notes.append(
+            f'gravity of the file, {gravity.tolist()}, is left out: it is {GRAVITY} m/s^2 downwards; the task '
+            "option randomize={'gravity': ...} sets another one"
+        )
+    moving = [
+        body.name or '?'
+        for body in outside
+        if body.tag == 'body' and (body.find_all('joint') or getattr(body, 'freejoint', None))
+    ]
+    if moving:
+        found.notes.append(f'bodies beside the character are left out: {", ".join(moving)}')
     lists = [*tree.actuator.all_children(), *tree.sensor.all_children()]
     lists += [*tree.keyframe.all_children(), *excluded]
     grounds = [item for item in tree.asset.texture if item.type == 'skybox']

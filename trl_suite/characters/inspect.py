@@ -128,7 +128,11 @@ class ModelInspector:
             raise ValueError(f'no joint attaches a body to the root {self.bodies[0]!r}')
         for i in self.joints:
             name, kind, axis = model.joint(i).name, int(model.jnt_type[i]), self.data.xaxis[i]
-            aside = abs(axis[1])
+            aside, (low, high) = abs(axis[1]), model.jnt_range[i].tolist()
+            if not model.jnt_limited[i] and low > high:  # read without limits
+                raise ValueError(
+                    f'{KINDS[kind]} {name!r} has limits {low:g} to {high:g}; expected the lower first'
+                )
             if kind == _SLIDE and not model.jnt_limited[i]:
                 raise ValueError(f'slide {name!r} has no limits; expected a range, in m')
             if not self.spatial and (

@@ -34,7 +34,7 @@ _REMEDIES = {
     'at least 4 vertices': 'it has less than 4 corners; expected a solid, such as a thin box',
     'mesh volume is too small': 'it encloses no volume, from which to derive a mass; expected an '
     'inertial with the mass, or a closed mesh',
-    'must be positive in geom': 'a size is 0; expected positive sizes',
+    'must be positive in geom': 'a size is 0 or negative; expected positive sizes',
     'surface area is too small': 'it is too small; is its scale right? expected lengths in m',
 }
 

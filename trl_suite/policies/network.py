@@ -314,6 +314,10 @@ class Policy:
                         f'(n, {size}), with the same n in all blocks'
                     )
             return np.concatenate(parts, axis=-1)
+        if hasattr(observation, 'step_type'):
+            raise TypeError(
+                'a time step was given; expected its observation: policy(time_step.observation)'
+            )
         flat = np.asarray(observation, dtype=float)
         k = self.observation_size
         if flat.ndim not in (1, 2) or flat.shape[-1] != k:

@@ -108,6 +108,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
         task = spec.own['task_type'](
             parts.character, parts.arena, actuation_model=parts.actuation, **own
         )
+        if not isinstance(task, Task):
+            raise TypeError(f'task returned {task!r}; expected a Task')
     for component in variation.components(common, parts.character):
         task.add(component)
     return task

@@ -335,6 +335,16 @@ class Task(composer.Task):
         self.attach(PhysicsWorld(physics, self.fields))
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
+        """Sets the time steps, s, before the model is compiled.
+
+        Raises:
+          RuntimeError: the model is compiled already.
+        """
+        if hasattr(self, 'world'):
+            raise RuntimeError(
+                'the model is compiled; set time steps before the environment is made, with the option '
+                'substeps of the task'
+            )
         super().set_timesteps(control_timestep, physics_timestep)
         self._substeps = self.physics_steps_per_control_step  # composer's property is slow
 

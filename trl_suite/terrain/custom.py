@@ -161,7 +161,7 @@ def from_heights(
       name: for messages.
       first: index of the first vertex along each axis, which is at first * spacing; by default the
         middle of the array is at the origin.
-      line: y in m of a section through (k, m) heights, which makes the ground planar.
+      line: y in m of a section through (k, m) heights, within them, which makes the ground planar.
       start_span: as for `from_function`.
 
     Raises:
@@ -184,6 +184,8 @@ def from_heights(
             raise ValueError(
                 f'{name}: heights of shape {heights.shape} are planar already; do not pass line'
             )
+        right, left = spacing * (corner[1] + np.array([0, heights.shape[1] - 1]))
+        checked(f'{name}: line', line, float, 'm', at_least=right, at_most=left)
         x = spacing * (corner[0] + np.arange(len(heights)))
         heights, corner = _Raster(heights, spacing, corner)(x, line), corner[:1]
     raster = _Raster(heights, spacing, corner)

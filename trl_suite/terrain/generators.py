@@ -46,6 +46,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.terrain.spatial.layout import Layout
+from trl_suite.util.digest import digest
 from trl_suite.util.errors import check_known
 from trl_suite.util.options import checked
 
@@ -150,7 +151,8 @@ def register(
       type_name: the `Type` in terrain files.
       defaults: the names of all its parameters, with their defaults; a `Parameter` has limits, too.
       replace: whether a type that belongs to another function may be replaced. A function with the
-        same module and name, e.g. of a notebook cell that is run again, always replaces it.
+        same module and name, e.g. of a notebook cell that is run again, always replaces it; one that
+        another function makes, if its contents are the same, too.
 
     Raises:
       ValueError: the name is taken; or a default is not finite, beyond its limits, or a Min above its
@@ -213,14 +215,20 @@ def _adding(
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two functions have the same module and qualified name; lambdas are always different."""
-    if inspect.unwrap(one) is inspect.unwrap(other):
+    """Whether two functions have the same module and qualified name; lambdas are always different.
+
+    Of functions that another function makes, the contents count as well.
+    """
+    one, other = inspect.unwrap(one), inspect.unwrap(other)
+    if one is other:
         return True
     (module, name), again = (
         (getattr(each, '__module__', ''), getattr(each, '__qualname__', '<lambda>'))
         for each in (one, other)
     )
-    return (module, name) == again and not name.endswith('<lambda>')
+    if (module, name) != again or name.endswith('<lambda>'):
+        return False
+    return '<locals>' not in name or digest(one) == digest(other)
 
 
 def draw(

@@ -212,8 +212,13 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
         )
     name = os.fspath(source)
     if isinstance(source, str) and not name.endswith(('.json', '.txt')):
-        check_known('terrain', (*PRESETS, *PRESETS3D), name)
-        return PRESETS[name] if name in PRESETS else PRESETS3D[name]
+        known = {**PRESETS, **PRESETS3D}
+        if name not in known and (name in GENERATORS or name in GENERATORS3D):
+            raise ValueError(
+                f"{name!r} is a type of terrain; expected {{'Type': {name!r}}}, or a preset"
+            )
+        check_known('terrain', known, name)
+        return known[name]
     content = read_json(existing(name), _without_repetition)
     if not isinstance(content, dict):
         raise ValueError(f'{name}: must hold a JSON object with keys Type and Params')

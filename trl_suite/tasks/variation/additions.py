@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from trl_suite.bodies.blocks import Block, by_name
 from trl_suite.engine import World
 from trl_suite.tasks.component import Component
 from trl_suite.tasks.rewards import Outcome, outcome
+from trl_suite.util import errors
 
 if TYPE_CHECKING:
     from trl_suite.tasks.task import Task
@@ -75,10 +77,13 @@ class Additions(Component):
             dict(failures),
         )
         for name, (weight, function) in self._rewards.items():
-            _check('reward', name, function, np.isfinite(weight), f'weight {weight!r}')
+            good = errors.is_number(weight) and math.isfinite(weight)
+            _check('reward', name, function, good, f'weight {weight!r}; expected a finite number')
         for name, (size, function) in self._extras.items():
             whole = isinstance(size, (int, np.integer)) and size > 0
-            _check('observation', name, function, whole, f'size {size!r}')
+            _check(
+                'observation', name, function, whole, f'size {size!r}; expected a positive integer'
+            )
         for name, function in self._failures.items():
             _check('failure', name, function, True, '')
         self.blocks = tuple(Block(name, int(size)) for name, (size, _) in self._extras.items())
@@ -88,6 +93,11 @@ class Additions(Component):
         for name in self._extras:
             if name in task.blocks:
                 raise ValueError(f'the task already has a block {name!r}; choose another name')
+        for name in self._rewards:
+            if name in [term.name for term in getattr(task, 'terms', ())]:
+                raise ValueError(
+                    f'the task already has a reward term {name!r}; choose another name'
+                )
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
@@ -164,6 +174,4 @@ def _check(kind: str, name: str, function: Any, good: Any, number: str) -> None:
     if not callable(function):
         raise ValueError(f'{kind} {name!r} is {function!r}; expected a function of the task')
     if not good:
-        raise ValueError(
-            f'{kind} {name!r} has {number}; expected a finite weight, or a positive integer size'
-        )
+        raise ValueError(f'{kind} {name!r} has {number}')
