@@ -148,15 +148,26 @@ def curve_path(id: str) -> str:
     return f'curves/{id}.png'
 
 
-def record(id: str) -> dict[str, Any] | None:
-    """Returns the training record (trained/README.md) of an environment's shipped policy, if any."""
-    path = resources.directory('trained') / f'{id}.json'
-    return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
+def record(name: str) -> dict[str, Any]:
+    """Returns a file of trained/ (see its README.md), such as the record of an environment; {} if none."""
+    path = resources.directory('trained') / f'{name}.json'
+    return json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}
 
 
 def shipped_run(found: dict[str, Any]) -> dict[str, Any]:
     """Returns the run of a training record whose policy is shipped."""
     return next(run for run in found['runs'] if run['seed'] == found['shipped'])
+
+
+def evaluation(id: str) -> dict[str, Any]:
+    """Returns the evaluation of the policy that an environment has, {} if none.
+
+    Of several seeds: in other episodes than those in which one was chosen.
+    """
+    shared, found = record('shared'), record(id)
+    if id in shared:
+        return shared[id]['evaluation']
+    return found.get('shipped_again') or shipped_run(found)['evaluation'] if found else {}
 
 
 def _digest(name: str) -> str:
@@ -316,7 +327,7 @@ def curve(id: str) -> np.ndarray:
     from matplotlib.figure import Figure
 
     found, spec = record(id), suite.find(id)
-    if found is None:
+    if not found:
         raise ValueError(f'no policy is shipped for {id!r}')
     type_ = task_type(spec)
     gait = type_.score == 'distance'

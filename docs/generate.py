@@ -188,10 +188,9 @@ def begun(settings: Mapping[str, Any], unit: str) -> str:
 def observing(spec: catalogue.EnvSpec) -> list[tuple[str, str]]:
     """Returns the results of the same environment with observed terrain, if there is one."""
     other = f'{spec.id.removesuffix("-v0")}_Terrain-v0'
-    found = gallery.record(other) if other in catalogue.BY_ID else None
-    if found is None:
+    result = gallery.evaluation(other)
+    if not result:
         return []
-    result = gallery.shipped_run(found)['evaluation']
     return [
         (
             'the same, but with observed terrain',
@@ -203,7 +202,7 @@ def observing(spec: catalogue.EnvSpec) -> list[tuple[str, str]]:
 
 def learnt(spec: catalogue.EnvSpec) -> str:
     found = gallery.record(spec.id)
-    if found is None:
+    if not found:
         return ''
     run = gallery.shipped_run(found)
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
@@ -473,11 +472,7 @@ def solved() -> str:
         score = task_type(spec).score
         if score == 'distance':
             gaits.add(spec.domain)
-        if spec.id in papers.stored('shared'):
-            scores[spec.domain].append(papers.stored('shared')[spec.id]['evaluation'][score])
-        elif entry := gallery.record(spec.id):
-            # Of several seeds: other episodes than those in which one was chosen.
-            measured = entry.get('shipped_again', gallery.shipped_run(entry)['evaluation'])
+        if measured := gallery.evaluation(spec.id):
             scores[spec.domain].append(measured[score])
     shares, metres = (
         ', '.join(

@@ -12,7 +12,6 @@ import gallery
 import numpy as np
 
 from trl_suite import describe
-from trl_suite.util import resources
 
 RUNS = pathlib.Path(__file__).resolve().parent / 'continual'
 # Action spaces (2017), supplement, table 4: normalised reward, mean ± standard deviation over 32
@@ -70,12 +69,6 @@ TASKS = {'soccer': 'Soccer', 'path': 'PathFollowing', 'pillars': 'Forest'}
 
 
 @functools.cache
-def stored(name: str) -> dict[str, Any]:
-    """Returns a JSON file of trained/."""
-    path = resources.directory('trained') / f'{name}.json'
-    return json.loads(path.read_text(encoding='utf-8'))
-
-
 def tables() -> dict[str, dict[str, str]]:
     """Returns the tables of each page in docs/reports/, by name."""
     return {
@@ -146,20 +139,13 @@ def plaid(kind: int) -> str:
     return table(('learner', '', *TERRAINS), rows)
 
 
-def shipped(id: str) -> dict[str, Any]:
-    """Returns the evaluation of the policy that is shipped for a gait environment."""
-    if id in stored('shared'):
-        return stored('shared')[id]['evaluation']
-    return gallery.shipped_run(stored(id))['evaluation']
-
-
 def gaits() -> str:
     rows = []
     for name in GAITS:
         id = f'FSM_{name}-v0'
-        found = shipped(id)
+        found = gallery.evaluation(id)
         low, high = found['distance_interval']
-        default = stored('default_gaits').get(id, {}).get('distance')
+        default = gallery.record('default_gaits').get(id, {}).get('distance')
         rows.append((
             f'`{id}`', f'{found["distance"]:.0f} ({low:.0f} to {high:.0f})',
             '–' if default is None else f'{default:.0f}',
@@ -168,7 +154,7 @@ def gaits() -> str:
 
 
 def footsteps() -> str:
-    found = stored('footsteps')['PD_Biped3D_LLC_General_Step-v0']
+    found = gallery.record('footsteps')['PD_Biped3D_LLC_General_Step-v0']
     return table(
         ('footstep controller', 'no fall', 'landing error, m'),
         ((name, f'{found[name]["survived"]:.0%}', f'{found[name]["landing"]:.3f}') for name in CONDITIONS),
@@ -179,16 +165,16 @@ def plans() -> str:
     rows = [
         (f'`{id}`', *(f'{found[policy]["reward"]:.2f}' for policy in ('scripted', 'reference')),
          f'{found["reference"]["survived"]:.0%}')
-        for id, found in stored('plans').items() if 'scripted' in found
+        for id, found in gallery.record('plans').items() if 'scripted' in found
     ]  # fmt: skip
     return table(('planner', 'score, scripted', 'score, trained', 'no fall in 200 s'), rows)
 
 
 def foresight() -> str:
     rows = [
-        (f'`{id}`', f'{shipped(id)["distance"]:.1f}',
+        (f'`{id}`', f'{gallery.evaluation(id)["distance"]:.1f}',
          *(', '.join(f'{metres:.1f}' for metres in found[kind]['metres']) for kind in ('base', 'noisy')))
-        for id, found in stored('foresight').items()
+        for id, found in gallery.record('foresight').items()
     ]  # fmt: skip
     return table(('environment', 'policy, m', 'base actions, m', 'all parameters, m'), rows)
 
@@ -201,7 +187,7 @@ def controllers(names: str) -> str:
 def styles() -> str:
     rows = []
     for name, (part, _) in STYLES.items():
-        found = stored('footsteps').get(controllers(part))
+        found = gallery.record('footsteps').get(controllers(part))
         if found is None:
             continue
         general, pushed = found['general'], found['pushes of 150 N']
@@ -226,7 +212,10 @@ def pair(found: dict[str, Any], *keys: str) -> str:
 
 
 def stands() -> str:
-    of = [stored('footsteps')[f'PD_Biped3D_LLC_{part}_Step-v0'] for part in ('General', 'Stand')]
+    of = [
+        gallery.record('footsteps')[f'PD_Biped3D_LLC_{part}_Step-v0']
+        for part in ('General', 'Stand')
+    ]
     rows = [
         (name, *(f'{each[name]["survived"]:.0%}, {each[name]["landing"]:.3f} m' for each in of))
         for name in STANDS
@@ -237,7 +226,7 @@ def stands() -> str:
 def transfer() -> str:
     rows = []
     for task, part in TASKS.items():
-        found = stored('plans')[f'PD_Biped3D_HLC_{part}-v0']
+        found = gallery.record('plans')[f'PD_Biped3D_HLC_{part}-v0']
         for name, (controller, published) in STYLES.items():
             under = '' if name == 'nominal' else f' with {controllers(controller)}'
             ours = [found.get(kind + under) for kind in ('reference', 'fine-tuned')]
