@@ -9,13 +9,16 @@
     model = SAC('MlpPolicy', envs).learn(10_000)
     policies.save(exported(model, envs.environment), 'sac.npz')
 
-For 'MlpPolicy' of PPO, A2C, SAC, TD3, DDPG and TQC; `VecNormalize` may scale the observations.
+For 'MlpPolicy' of PPO, A2C, SAC, TD3, DDPG and TQC; `VecNormalize` may scale the observations: then
+load a saved model with it, PPO.load('ppo.zip', env=VecNormalize.load('ppo.pkl', envs)).
 """
 
 import numpy as np
 import torch
 
 from trl_suite import policies
+
+ACTIVATIONS = {torch.nn.Tanh: 'tanh', torch.nn.ReLU: 'relu', torch.nn.ELU: 'elu'}
 
 
 def exported(model, environment):
@@ -29,6 +32,10 @@ def exported(model, environment):
       environment: the `VectorEnvironment` that it was trained in, or a similar one.
     """
     net, squashed = model.policy, hasattr(model.policy, 'actor')
+    if net.activation_fn not in ACTIVATIONS or (model.use_sde and net.squash_output):
+        raise ValueError(
+            'expected activations tanh, relu or elu, and no squashed output with use_sde'
+        )
     parts = (
         net.actor if squashed else torch.nn.Sequential(net.mlp_extractor.policy_net, net.action_net)
     )
@@ -47,7 +54,5 @@ def exported(model, environment):
         weights[-1], biases[-1] = np.pad(weights[-1], ((0, 0), (1, 0))), np.pad(biases[-1], (1, 0))
         size = len(environment.action_map)
         options |= {'choices': np.zeros((1, size)), 'largest_change': np.float32(1)}
-    activation = 'relu' if squashed else 'tanh'
-    return policies.Policy.for_environment(
-        environment, weights, biases, activation=activation, **options
-    )
+    options['activation'] = ACTIVATIONS[net.activation_fn]
+    return policies.Policy.for_environment(environment, weights, biases, **options)

@@ -382,7 +382,7 @@ class NoiseTest(parameterized.TestCase):
 
 
 class DelayTest(parameterized.TestCase):
-    @parameterized.parameters(0.5, 37.0, 500.0)
+    @parameterized.parameters(3.0, 37.0, 500.0)
     def test_a_control_takes_effect_after_the_delay(self, delay):
         """What acts at step s is the control given at step s - lag, at first the first."""
         environment = make(delay=delay)

@@ -235,6 +235,7 @@ with contextlib.suppress(ImportError):
     import stable_baselines_export
     import stable_baselines_learners
     import td3_learner
+    import torch
     from stable_baselines3.common.vec_env import VecNormalize
 
     from trl_suite.adapters.stable_baselines import SuiteVecEnv
@@ -253,6 +254,29 @@ with contextlib.suppress(ImportError):
             path = self.folder / 'policy.npz'
             policies.save(policy, path)
             np.testing.assert_array_equal(policies.load(path)(observations), policy(observations))
+
+        def test_other_activations(self):
+            envs = SuiteVecEnv(ID, 1, seed=0)
+
+            def exported(kind, activation, **options):
+                keywords = {'activation_fn': activation}
+                model = kind('MlpPolicy', envs, policy_kwargs=keywords, seed=0, **options)
+                return model, stable_baselines_export.exported(model, envs.environment)
+
+            for kind, activation in (
+                (stable_baselines3.PPO, torch.nn.ReLU), (stable_baselines3.PPO, torch.nn.ELU),
+                (stable_baselines3.SAC, torch.nn.Tanh),
+            ):  # fmt: skip
+                model, policy = exported(kind, activation)
+                observations = np.random.default_rng(0).normal(size=(5, policy.observation_size))
+                expected, _ = model.predict(observations.astype(np.float32), deterministic=True)
+                np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+            for kind, activation, options in (
+                (stable_baselines3.PPO, torch.nn.SiLU, {}),
+                (stable_baselines3.SAC, torch.nn.ReLU, {'use_sde': True}),
+            ):
+                with self.assertRaisesRegex(ValueError, 'expected activations tanh, relu or elu'):
+                    exported(kind, activation, **options)
 
         def test_an_exported_policy_scales_observations_as_the_library_does(self):
             scaled = VecNormalize(SuiteVecEnv(ID, 2, seed=0))

@@ -328,6 +328,8 @@ class RolloutTest(CommandTest):
         ('is not JSON', GAPS, '--option', 'sensors={"noise": 0.1'),
         ("did you mean 'randomize'", GAPS, '--option', 'randomise=robot'),
         ('terrain_level is 9', GAPS, '--option', f'terrain_level={"9" * 400}'),
+        ('the seed is no option; use --seed', GAPS, '--option', 'random=1'),
+        ("is not JSON: key 'friction' is given twice", GAPS, '--option', 'randomize={"friction": 1, "friction": 2}'),
         ('is not JSON', GAPS, '--option', f'sensors={"[" * 100_000}'),
         ('File name too long', GAPS, '--video', f'{"a" * 250}.mp4'),
     )  # fmt: skip

@@ -351,6 +351,24 @@ class PushTest(parameterized.TestCase):
 class SensorTest(parameterized.TestCase):
     """What is observed is the exact observation with the noise that was asked for."""
 
+    @parameterized.parameters(
+        ({'noise': {'pose': 0.5}}, {'pose': 0.5}), ({'noise': {}}, {}),
+        ({'noise': 0.3}, {'pose': 0.3, 'velocity': 0.3, 'terrain': 0.3}),
+    )  # fmt: skip
+    def test_options_change_a_preset_where_they_name_it(self, options, changed):
+        steps, environment = [], made(PLANAR, sensors={'preset': 'robot', **options})
+        for _ in range(60):
+            environment.reset()
+            error = environment.step(zeros(environment)).observation
+            clean = environment.info['clean_observation']
+            steps.append(error['observations'] - clean)
+        found = np.array(steps)
+        for name in ('pose', 'velocity', 'terrain'):
+            [preset] = [b.noise.noise[1] for b in environment.task.observed if b.name == name]
+            part = found[:, environment.blocks[name]]
+            part = part - np.median(part, axis=1, keepdims=True) if name == 'terrain' else part
+            self.assertGreater(np.std(part), 0.6 * changed.get(name, preset))
+
     @parameterized.parameters(PLANAR, TERRAIN3D)
     def test_noise_and_bias(self, id_):
         noise, bias = {'terrain': 0.05, 'pose': 0.01}, {'velocity': 0.2, 'terrain': 0.3}

@@ -84,7 +84,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
           ValueError: unknown names or options; the message has the closest matches.
         """
-        self._flat, self._dtype = flat_observation, arguments.check_dtype(dtype)
+        self._flat = checked('flat_observation', flat_observation, bool)
+        self._dtype = arguments.check_dtype(dtype)
         if not isinstance(environment, Environment):
             spec = catalogue.spec_of(environment)
             environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
@@ -200,7 +201,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
                 f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
             )
         observation = self.environment.reset(env_ids, seed, (options or {}).get('level'))
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         return observation, masked(flat(self.environment.info), env_ids)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:

@@ -95,9 +95,13 @@ def _option(text: str) -> tuple[str, object]:
     name, equals, value = text.partition('=')
     if not (name and equals):
         raise argparse.ArgumentTypeError(f'{text!r} is not NAME=JSON, such as randomize=robot')
+    if name == 'random':
+        raise argparse.ArgumentTypeError(f'{text!r}: the seed is no option; use --seed')
     try:
-        return name, json.loads(value)
-    except (ValueError, RecursionError):
+        return name, json.loads(value, object_pairs_hook=files.without_repetition)
+    except (ValueError, RecursionError) as error:
         if value[:1] in ('{', '[', '"'):
-            raise argparse.ArgumentTypeError(f'the value of {text!r} is not JSON') from None
+            raise argparse.ArgumentTypeError(
+                f'the value of {text!r} is not JSON: {error}'
+            ) from None
         return name, value

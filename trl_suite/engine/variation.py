@@ -105,6 +105,8 @@ class Variation:
             model.geom_solimp[self._slides, 0] = 0.0
             model.geom_solimp[self._slides, 2] = own.contact_depth[env_id]
         if 'contact_time' in varied:
+            # MuJoCo would use this bound, too; `properties` have what acts.
+            own.contact_time[env_id] = max(own.contact_time[env_id], 2 * model.opt.timestep)
             model.geom_solref[self._slides, 0] = own.contact_time[env_id]
         if 'damping' in varied:
             model.dof_damping[self._dofs] = self._damping * own.damping[env_id]

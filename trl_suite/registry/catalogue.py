@@ -54,6 +54,9 @@ def find(id: str) -> EnvSpec:
         raise TypeError(f'the id of an environment is a string, not {id!r}')
     spec = BY_ID.get(id) or ALIASES.get(id)
     if spec is None:
+        own = id.removeprefix('trl_suite/')
+        if own != id and own in BY_ID:
+            raise ValueError(f'{id!r} is an id of Gymnasium; expected {own!r}')
         raise ValueError(errors.unknown('environment', id, ALIASES if '/' in id else BY_ID))
     return spec
 

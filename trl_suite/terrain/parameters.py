@@ -48,7 +48,7 @@ import trl_suite.terrain.spatial.features  # noqa: F401
 from trl_suite.terrain.generators import GENERATORS, GENERATORS3D, Generator, check
 from trl_suite.terrain.spatial.layout import GRID
 from trl_suite.util.errors import check_known, is_number, unknown
-from trl_suite.util.files import existing, read_json
+from trl_suite.util.files import existing, read_json, without_repetition
 from trl_suite.util.options import checked
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
@@ -113,18 +113,20 @@ class Terrain:
 
         Args:
           terrain_level: number of the set; between whole numbers, each parameter is interpolated
-            linearly between the two neighbouring sets. Clamped to the existing sets.
+            linearly between the two neighbouring sets.
 
         Raises:
-          ValueError: terrain_level is not a number.
+          ValueError: terrain_level is not a number from 0 to that of the last set.
         """
-        if not is_number(terrain_level):
-            raise ValueError(f'terrain_level is {terrain_level!r}; expected a number')
         defaults = self.generator.defaults
         sets = [{**defaults, **values} for values in self.parameter_sets] or [defaults]
-        clamped = min(max(float(terrain_level), 0.0), len(sets) - 1.0)
-        k = int(clamped)
-        weight = clamped - k
+        if not is_number(terrain_level) or not 0 <= terrain_level <= len(sets) - 1:
+            raise ValueError(
+                f'terrain_level is {terrain_level!r}; expected a number from 0 to {len(sets) - 1}, as '
+                f'{self.name!r} has {len(sets)} parameter set{"s" * (len(sets) > 1)}'
+            )
+        k = int(terrain_level)
+        weight = terrain_level - k
         if not weight:
             return sets[k]
         return {key: (1 - weight) * a + weight * sets[k + 1][key] for key, a in sets[k].items()}
@@ -179,15 +181,6 @@ def _without_overlays(values: Any) -> Any:
     return {key: value for key, value in values.items() if key not in _OVERLAYS or value}
 
 
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in content:
-            raise ValueError(f'key {key!r} is given twice')
-        content[key] = value
-    return content
-
-
 def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrain:
     """Returns a terrain.
 
@@ -219,7 +212,7 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
             )
         check_known('terrain', known, name)
         return known[name]
-    content = read_json(existing(name), _without_repetition)
+    content = read_json(existing(name), without_repetition)
     if not isinstance(content, dict):
         raise ValueError(f'{name}: must hold a JSON object with keys Type and Params')
     return _from_mapping(name, content)

@@ -131,6 +131,16 @@ def read_text(path: Path) -> str:
         ) from None
 
 
+def without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Returns an object of JSON, as a hook of `json.loads`; a key that is given twice is an error."""
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f'key {key!r} is given twice')
+        content[key] = value
+    return content
+
+
 def read_json(
     path: Path, object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None
 ) -> Any:

@@ -51,6 +51,11 @@ class Motors(Component):
         self._units = units = realism.Units(self._character, model)
         self._timestep = world.engine.timestep
         longest = self._steps(actuators.delay.high)
+        if actuators.delay.high and not longest:
+            raise ValueError(
+                f'delay is {actuators.delay.high:g} ms, which is rounded to 0; expected 0, or more than '
+                f'half a physics step of {1000 * self._timestep:.3g} ms'
+            )
         slots = longest // self.task.steps_per_call + 2 if longest else 0
         self.motors = world.set_motors(
             realism.limits(actuators, units, model, self._curves),

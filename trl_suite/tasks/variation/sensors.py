@@ -207,11 +207,9 @@ def _entries(value: Any) -> list[tuple[str, Any]]:
 
 def _of(given: Any, name: str, default: Any, flags: bool) -> Any:
     """Returns the value for a block; a number for all blocks is not for flags."""
-    if given is None:
-        return default
     if isinstance(given, Mapping):
-        return given.get(name, 0)
-    return 0 if flags else given
+        return given.get(name, default)
+    return default if given is None or flags else given
 
 
 @compiled

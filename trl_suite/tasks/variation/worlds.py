@@ -101,7 +101,7 @@ class WorldConfig(Config):
     )
     contact_time: Range | None = option(
         None,
-        'time constant of contacts; 0.005 otherwise, and at least two physics steps',
+        'time constant of contacts, at least two physics steps; 0.005 or two physics steps otherwise',
         **within(1e-3, 1, 's'),
     )
     push: PushConfig | None = option(
