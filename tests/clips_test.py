@@ -43,7 +43,7 @@ WALKS = ('biped3d_mocap', 'biped3d_full_mocap')
 # lean of the trunk, forwards and to the right, rad; in the longest step, m. 0: the same.
 HIP, LEFT, RIGHT, LEAN, TILT, LENGTH = range(6)
 STYLES = {
-    '_high_knees': {HIP: -0.05, LEFT: 0.4, RIGHT: 0.4},
+    '_high_knees': {HIP: -0.1, LEFT: 0.4, RIGHT: 0.4},
     '_straight_legs': {HIP: 0.02, LEFT: -0.5, RIGHT: -0.5},
     '_one_straight_leg': {HIP: 0.015, LEFT: -0.5},
     '_forward_lean': {LEAN: 0.3, TILT: 0},

@@ -302,24 +302,26 @@ STYLED = {
         footstep_scale=5.0, heading_scale=2.0,
     ),
 }  # fmt: skip
+# With more pushes, when the style is there.
+STEADIER = ({
+    'samples': 3e6, 'num_envs': 128, 'start_count': 1e9, 'value_first': 1e5, 'learning_rate': 2e-4,
+    'last_learning_rate': 2e-5, 'evaluate_every': 3e5,
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.1}, 'pushes': pushes(80, 180)},
+            {'plans': {**FREE, 'sharp': 0.02}, 'pushes': pushes(100, 200)},
+            {**EVEN, 'pushes': pushes(100, 180)}, {'plans': {**BY_ROOT, 'root_turn': 0.6}},
+            {'plans': {'sharp': 0.1}}, PLACES, {'plans': BY_ROOT, 'pushes': pushes(60, 160)},
+            {'plans': FREE, 'pushes': pushes(140, 160)},
+        ),
+        footstep_scale=5.0, heading_scale=2.0,
+    ),
+},)  # fmt: skip
 # Left and right differ: the nominal policy, which mirrors, is imitated first by one that does not.
 ONE_SIDED = {
     **STYLED, 'mirrored': False, 'samples': 4e6, 'start': 'nominal', 'start_std': None, 'initial_std': 0.12,
     'cloned': 6e5, 'clonings': 4, 'cloning_epochs': 8, 'last_cloning_rate': 5e-5, 'value_first': 8e5,
-    'further': ({  # with more pushes, when the style is there
-        'samples': 3e6, 'num_envs': 128, 'start_count': 1e9, 'value_first': 1e5, 'learning_rate': 2e-4,
-        'last_learning_rate': 2e-5, 'evaluate_every': 3e5,
-        'stages': together(
-            (
-                {'plans': {'sharp': 0.1}, 'pushes': pushes(80, 180)},
-                {'plans': {**FREE, 'sharp': 0.02}, 'pushes': pushes(100, 200)},
-                {**EVEN, 'pushes': pushes(100, 180)}, {'plans': {**BY_ROOT, 'root_turn': 0.6}},
-                {'plans': {'sharp': 0.1}}, PLACES, {'plans': BY_ROOT, 'pushes': pushes(60, 160)},
-                {'plans': FREE, 'pushes': pushes(140, 160)},
-            ),
-            footstep_scale=5.0, heading_scale=2.0,
-        ),
-    },),
+    'further': STEADIER,
 }  # fmt: skip
 SHORT = {'length': (0.0, 0.1), 'change': 1.0, 'turn': 0.2}
 IN_PLACE = {
@@ -575,7 +577,8 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     ('PD_Biped3D_LLC_Bumps_Step-v0', STEPS_ON),
     ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
-    *((f'PD_Biped3D_LLC_{name}_Step-v0', STYLED) for name in ('HighKnees', 'StraightLegs', 'ForwardLean')),
+    ('PD_Biped3D_LLC_HighKnees_Step-v0', {**STYLED, 'further': STEADIER}),
+    *((f'PD_Biped3D_LLC_{name}_Step-v0', STYLED) for name in ('StraightLegs', 'ForwardLean')),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', ONE_SIDED) for name in ('OneStraightLeg', 'SidewaysLean')),
     ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
     ('PD_Biped3D_LLC_Stand_Step-v0', STANDING),

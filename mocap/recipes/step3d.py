@@ -69,7 +69,15 @@ _ROWS = {
 }
 # Pitch of pelvis and torso, drop of the pelvis on the swing side, lean of the torso to the right, rad;
 # detour of the swing foot, pelvis left of the middle of the feet, m.
-_POSTURE = {'lean': -0.05, 'torso': -0.02, 'list': 0.07, 'tilt': 0.0, 'aside': 0.0, 'yoff': 0.0}
+_POSTURE = {
+    'lean': -0.05,
+    'torso': -0.02,
+    'list': 0.07,
+    'tilt': 0.0,
+    'aside': 0.0,
+    'ahead': 0.0,
+    'yoff': 0.0,
+}
 SHAPES: Mapping[str, Mapping[str, float]] = {
     name: dict(zip(NAMES, row, strict=True)) | _POSTURE for name, row in _ROWS.items()
 }
@@ -85,7 +93,7 @@ _STRAIGHT = {
 }
 # What the steps of a style have instead.
 STYLES: Mapping[str, Mapping[str, float]] = {
-    'high_knees': {'lift': 0.28},
+    'high_knees': {'lift': 0.25, 'lsk': -0.3, 'ahead': 0.15},
     'straight_legs': _STRAIGHT,
     'one_straight_leg': {},
     'sideways_lean': {'tilt': 0.35, 'yoff': 0.04},
@@ -279,6 +287,7 @@ def _swing(p, start: Node, end: Node, trail, land, u):
     passing = trail[1] - trail[0] * slope
     path[:, 1] += max(0.0, CLEARANCE - passing) * bump(tau)
     path[:, 1] += p['aside'] * bump(tau)
+    path[:, 0] += p['ahead'] * late_bump(tau)
     up = p['lift'] * (0.5 + 0.5 * min(size, 1)) * bump(tau) * (1 + p['lsk'] * (1 - 2 * tau))
     return np.column_stack([path, sole + up]), tilt, shift
 
