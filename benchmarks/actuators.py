@@ -10,7 +10,6 @@ them little; environments with and without an option take turns.
 """
 
 import argparse
-import json
 import pathlib
 import time
 
@@ -72,8 +71,7 @@ def store(name: str, result: object) -> None:
     """Stores results under a name, beside the others."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
     found[name] = result
-    with files.replacing(RESULTS) as part:
-        part.write_text(json.dumps(found) + '\n')
+    files.write_json(found, RESULTS)
 
 
 # Costs.

@@ -20,7 +20,6 @@ physics steps of a control step. Policies are not trained for it.
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 from collections.abc import Callable
 from typing import Any
@@ -258,15 +257,14 @@ def run(episodes: int, seed: int, path: pathlib.Path) -> dict[str, Any]:
     """Measures what the file does not have yet; returns all, by environment and change."""
     found: dict[str, Any] = {'episodes': episodes, 'seed': seed, 'results': {}}
     if path.exists():
-        found = json.loads(path.read_text())
+        found = files.read_json(path)
         if (found['episodes'], found['seed']) != (episodes, seed):
             raise ValueError(f'{path} has other episodes or another seed; give another --json')
     for id_, name in tqdm.tqdm(cells()):
         row = found['results'].setdefault(id_, {})
         if name not in row:
             row[name] = measure(id_, name, episodes, seed)
-            with files.replacing(path) as part:
-                part.write_text(json.dumps(found) + '\n')
+            files.write_json(found, path)
     return found
 
 

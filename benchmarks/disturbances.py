@@ -10,7 +10,6 @@ the repeats, because machines are shared. The actions are zeros; the options are
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import time
 
@@ -75,8 +74,7 @@ def main() -> None:
         cells = [(name, f'{step:.1f}', f'{reset:.0f}') for name, (step, reset) in found.items()]
         print(id_, tables.table(('options', 'step (us)', 'reset (us)'), cells), sep='\n')
     if arguments.json is not None:
-        with files.replacing(arguments.json) as part:
-            part.write_text(json.dumps(figures) + '\n')
+        files.write_json(figures, arguments.json)
 
 
 if __name__ == '__main__':

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import pathlib
 import time
 from typing import Any
@@ -25,6 +24,7 @@ import tqdm
 
 from trl_suite import suite
 from trl_suite.engine import native
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
@@ -145,7 +145,7 @@ def main() -> None:
         figures[f'{id_}, {n}'] = {name: round(value, 4) for name, value in found.items()}
         tqdm.tqdm.write(f'{id_}, {n}: ' + ', '.join(f'{k} {v:.3g}' for k, v in found.items()))
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=1))
+        files.write_json(figures, arguments.json)
 
 
 if __name__ == '__main__':

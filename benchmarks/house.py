@@ -10,12 +10,13 @@ The import of the package is not included.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import pathlib
 import subprocess
 import sys
 import tempfile
+
+from trl_suite.util import files
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 IDS = {
@@ -74,7 +75,7 @@ def main() -> None:
     for name, value in figures.items():
         print(f'{name:<36}{value:>8}')
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=1))
+        files.write_json(figures, arguments.json)
 
 
 if __name__ == '__main__':

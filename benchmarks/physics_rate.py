@@ -20,7 +20,7 @@ compared at the default rate. The conclusion is in physics_rate.md.
 """
 
 import argparse
-import json
+import pathlib
 import time
 
 import mujoco
@@ -28,6 +28,7 @@ import numpy as np
 
 from trl_suite import suite
 from trl_suite.tasks.common.control import SUBSTEPS as DEFAULT
+from trl_suite.util import files
 
 RATES = (100, 40, 20, 10, 8, 5, 4)  # physics steps per control step of 1/30 s, finest first
 CONTROL_RATE = 30  # Hz
@@ -487,7 +488,7 @@ def plot(figures, file):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--quick', action='store_true', help='few starts, as a test of the program')
-    parser.add_argument('--json', help='write the figures to this file')
+    parser.add_argument('--json', type=pathlib.Path, help='write the figures to this file')
     parser.add_argument('--plot', help='plot the figures to this file')
     arguments = parser.parse_args()
     starts, episodes = (3, 2) if arguments.quick else (STARTS, RANDOM_EPISODES)
@@ -504,9 +505,7 @@ def main():
         figures['solvers'][name] = solvers(GROUPS[name], starts, episodes // 2)
     report(figures)
     if arguments.json:
-        with open(arguments.json, 'w') as file:
-            json.dump(rounded(figures), file)
-            file.write('\n')
+        files.write_json(rounded(figures), arguments.json)
     if arguments.plot:
         plot(figures, arguments.plot)
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import collections
 import functools
-import json
 import pathlib
 import sys
 import time
@@ -32,6 +31,7 @@ from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import World
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.terrain.spatial.layout import Layout
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
@@ -117,7 +117,7 @@ def main() -> None:
         figures[id_] = {name: round(value, 4) for name, value in found.items()}
         tqdm.tqdm.write(f'{id_}: ' + ', '.join(f'{k} {v:.3f}' for k, v in found.items()) + ' ms')
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=1))
+        files.write_json(figures, arguments.json)
 
 
 if __name__ == '__main__':

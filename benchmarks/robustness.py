@@ -11,7 +11,6 @@ table of the page has the return divided by that without disturbance.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import pathlib
 from typing import Any
@@ -99,7 +98,7 @@ def run(
     settings = {'episodes': episodes, 'step_limit': step_limit}
     found: dict[str, Any] = {**settings, 'seeds': {}}
     if path.exists():
-        found = json.loads(path.read_text())
+        found = files.read_json(path)
         if {name: found[name] for name in settings} != settings:
             raise ValueError(f'{path} has other settings; remove it, or give another --json')
     jobs = [(seed, id_, *cell) for seed in seeds for cell in cells() for id_ in ids]
@@ -115,8 +114,7 @@ def run(
             name: result[name]
             for name in ('return', 'return_interval', 'completion_rate', 'distance', 'diverged')
         }
-        with files.replacing(path) as part:
-            part.write_text(json.dumps(found) + '\n')
+        files.write_json(found, path)
     return found
 
 

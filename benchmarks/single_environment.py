@@ -13,7 +13,7 @@ blocks.
 """
 
 import argparse
-import json
+import pathlib
 import statistics
 import time
 
@@ -22,6 +22,8 @@ import numpy as np
 
 from trl_suite import suite  # isort: skip  (before dm_control: it selects the rendering backend)
 from dm_control import suite as dm_suite
+
+from trl_suite.util import files
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 BLOCK = 200  # control steps
@@ -90,7 +92,7 @@ def measure(cases, blocks):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--steps', type=int, default=6000, help='control steps per case')
-    parser.add_argument('--json', help='also write the figures to this file')
+    parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
     arguments = parser.parse_args()
     cases = {}
     for substeps in (10, 20):
@@ -104,8 +106,7 @@ def main():
     for name, row in figures.items():
         print(name, *(f'{key}: {value}' for key, value in row.items()), sep='\n    ')
     if arguments.json:
-        with open(arguments.json, 'w') as file:
-            json.dump(figures, file, indent=2)
+        files.write_json(figures, arguments.json)
 
 
 if __name__ == '__main__':

@@ -19,7 +19,6 @@ import argparse
 import ctypes
 import gc
 import importlib.metadata
-import json
 import os
 import pathlib
 import resource
@@ -184,8 +183,7 @@ def main():
             run['environments'] + 1,
         )
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
-        with files.replacing(arguments.file) as part:
-            part.write_text(json.dumps(figures) + '\n')
+        files.write_json(figures, arguments.file)
         bar.set_postfix_str(f'{steps / 1e6:.2f} M control steps, {run["memory"][-1][2]} MB')
         bar.update(min(round(run['seconds']), bar.total) - bar.n)
         if time.time() >= begin + arguments.seconds:

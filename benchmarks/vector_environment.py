@@ -19,13 +19,14 @@ Prints, with random actions and including resets:
 import argparse
 import concurrent.futures
 import importlib.util
-import json
 import multiprocessing
 import os
+import pathlib
 import resource
 
 from trl_suite.cli import bench
 from trl_suite.cli.bench import actions, rate, raw
+from trl_suite.util import files
 
 IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
@@ -161,7 +162,7 @@ def plot(figures, path):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
-    parser.add_argument('--json', help='also write the figures to this file')
+    parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
     parser.add_argument('--plot', help='also plot rate against number of simulations')
     parser.add_argument('--num-envs', type=int, nargs='*', default=SIZES)
     parser.add_argument('--no-peers', action='store_true')
@@ -184,8 +185,7 @@ def main():
         for name, value in figures['peers'].items():
             print(f'{name}: {value:.3f} of raw mj_step of its model')
     if arguments.json:
-        with open(arguments.json, 'w') as file:
-            json.dump(figures, file)
+        files.write_json(figures, arguments.json)
     if arguments.plot:
         plot(figures, arguments.plot)
 

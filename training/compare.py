@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import json
 import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -322,7 +321,7 @@ def main() -> None:
     path = arguments.json or arguments.runs / f'{name}.json'
     found: dict[str, Any] = {'samples': samples, 'results': {}}
     if path.exists():
-        found = json.loads(path.read_text())
+        found = files.read_json(path)
         if found['samples'] != samples:
             raise ValueError(
                 f'{path}: samples is {found["samples"]}, not {samples}; give another --json'
@@ -333,8 +332,7 @@ def main() -> None:
             folder = arguments.runs / f'{name}_{samples:g}' / cell / f'seed_{seed}'
             found['results'][f'{cell}/{seed}'] = compared.job(cell, seed, samples, folder)
             path.parent.mkdir(parents=True, exist_ok=True)
-            with files.replacing(path) as part:
-                part.write_text(json.dumps(found) + '\n')
+            files.write_json(found, path)
     seeds = sorted({int(key.rsplit('/', 1)[1]) for key in found['results']})
     text = f'After {samples:g} samples, seeds {", ".join(map(str, seeds))}. '
     print(text := text + compared.table(found['results'], seeds))
