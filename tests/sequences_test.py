@@ -20,6 +20,7 @@ from programs import CommandTest, run
 from trl_suite import benchmark, evaluation, sequences, suite
 from trl_suite.runs import results, running
 from trl_suite.util import machine
+from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import continual
@@ -57,6 +58,7 @@ class CatalogueTest(parameterized.TestCase):
 
         assert_refused(
             self,
+            (lambda: sequences.Sequence(3, SHORT.ids), 'name is 3; expected a string'),
             (lambda: sequences.get('plaid_bog'), "'plaid_bog'; did you mean 'plaid_dog'"),
             (lambda: benchmark.get(ID[:-1]), f"of the benchmark '{ID[:-1]}'.*did you mean"),
             (mine('PD_Bog2D_Gaps_Terrain-v0'), "unknown environment 'PD_Bog2D_Gaps_Terrain-v0'"),
@@ -122,6 +124,8 @@ class MetricsTest(parameterized.TestCase):
         ('average_performance', ((1,),), r'expected \(T, T\)'),
         ('average_performance', (1, 2), r'expected \(T, T\)'),
         ('forward_transfer', SCORES, (0, 0), 'initial: shape'),
+        ('metrics', SCORES, [0.0, np.nan, 0.0], 'initial: the metric uses an entry'),
+        ('learning_transfer', ['a'], [0.1], 'curve: expected an array of numbers'),
         ('learning_transfer', [0.5], [0.1, 0.3], r'shape is \(1,\); expected \(2,\)'),
         ('learning_transfer', [0.5, None], [None, 0.1], 'no point in common'),
         ('learning_transfer', [1.0], [1.0], 'expected less than 1'),
@@ -170,6 +174,22 @@ class StageTest(absltest.TestCase):
         with self.assertRaisesRegex(sequences.BudgetExceededError, 'has ended'):
             environments.step(action, [0])
 
+    def test_steps_that_are_refused_are_free(self):
+        stage = self.stage()
+        environments = stage.environments(2, autoreset='disabled', step_limit=1)
+        action = np.zeros((2, len(environments.action_map)))
+        step = environments.step
+        assert_refused(
+            self,
+            (lambda: step(action), 'before the first reset'),
+            (lambda: (environments.reset(), step(action[:1])), 'action'),
+            (lambda: step(np.full_like(action, np.nan)), 'action'),
+            (lambda: (step(action), step(action)), 'has ended'),
+            (lambda: (environments.close(), step(action)), 'closed'),
+            error=(ValueError, RuntimeError),
+        )
+        self.assertEqual(stage.samples.sum(), 2)
+
     def test_training_seeds_only(self):
         """Those of two calls, stages or runs differ, and none is a seed for tests."""
         drawn = [
@@ -183,12 +203,15 @@ class StageTest(absltest.TestCase):
         self.assertEqual(environments.seeds.tolist(), list(drawn[0]))
         environments.reset(seed=5)
         self.assertEqual(environments.seeds.tolist(), sequences.train_seeds(3, 5))
+        foreign = VectorEnvironment(SHORT.ids[1], 3, seed=sequences.test_seeds(3))
+        foreign.reset()
         make, for_tests = self.stage().environments, 'is for tests; expected training seeds'
         assert_refused(
             self,
             (lambda: environments.seed([1, 2, 2**31]), for_tests),
             (lambda: environments.seed(sequences.test_seeds(3)), for_tests),
             (lambda: environments.reset(seed=2**31), for_tests),
+            (lambda: environments.set_state(foreign.get_state()), for_tests),
             (lambda: environments.seed(None), 'seed is None'),
             (lambda: environments.seed(1.5), 'seed is 1.5; expected a whole number'),
             (lambda: environments.seed(-1), 'seed is -1; expected a whole number at least 0'),
@@ -197,7 +220,7 @@ class StageTest(absltest.TestCase):
         )
 
     def test_curve(self):
-        """Ten episodes of two steps fill the first half of the budget."""
+        """Ten episodes of two steps, their limit, fill the first half of the budget."""
         stage = self.stage(budget=40)
         environments = stage.environments(1, step_limit=2, autoreset='disabled')
         action = np.zeros((1, len(environments.action_map)))
@@ -205,8 +228,7 @@ class StageTest(absltest.TestCase):
         for _ in range(10):
             environments.reset()
             rewards.append(sum(environments.step(action).reward[0] for _ in range(2)))
-        limit = suite.find(SHORT.ids[1]).step_limit
-        expected = [float(reward) / limit for reward in rewards] + [None] * 10
+        expected = [float(reward) / 2 for reward in rewards] + [None] * 10
         self.assertEqual(stage.curve(), expected)
         # An episode that is broken off does not count.
         environments.reset()
@@ -216,6 +238,23 @@ class StageTest(absltest.TestCase):
             environments.step(action)
         self.assertAlmostEqual(stage.curve()[11], expected[0], delta=0.5 * expected[0])
         self.assertIsNone(stage.curve()[10])
+
+    def test_curves_of_episodes_that_are_continued(self):
+        """A copy has the rewards of the original; those before a state are not known."""
+        stage = self.stage(budget=20)
+        environments, others = (stage.environments(1, step_limit=2) for _ in range(2))
+        action = np.zeros((1, len(environments.action_map)))
+        environments.reset()
+        others.reset()
+        first = environments.step(action).reward[0]
+        state = environments.get_state()
+        others.copy_from(environments, [0], [0])
+        second = others.step(action).reward[0]
+        environments.set_state(state)
+        environments.step(action)
+        expected = [None] * 20
+        expected[1] = float(first + second) / 2
+        self.assertEqual(stage.curve(), expected)
 
 
 class Counter:
@@ -422,6 +461,16 @@ class RunTest(RunCase):
             (run(Counter(), budget=0), 'budget is 0'),
             (run(Counter(), stages=4), 'stages is 4; expected a whole number from 1 to 3'),
             (run(Counter(), path=self.folder / 'result.txt'), "'.txt'"),
+            (
+                lambda: sequences.run(sequences.Sequence('plaid_dog', SHORT.ids), Counter()),
+                "'plaid_dog' is a sequence of the benchmark with other contents",
+            ),
+            (
+                lambda: sequences.run(
+                    sequences.Sequence('mine', (SHORT.ids[0], 'plaid/biped_flat')), Counter()
+                ),
+                "'mine': PD_Biped2D_Flat_Terrain-v0 has other observations or actions",
+            ),
         )
         with self.assertRaisesRegex(TypeError, 'expected the methods train and policy'):
             self.run_short(object())
@@ -452,9 +501,12 @@ class ResultTest(RunCase):
         ('sequence', 'plaid_dog', r"ids is \['PD_Dog2D_Flat.*expected \['PD_Dog2D_Flat.*Incline"),
         ('ids', ['PD_Dog2D_Flat_Terrain-v0'], 'expected two or more environments'),
         ('ids', 'flat', "ids is 'flat'; expected a list of strings"),
-        ('budget', 14.5, 'budget is 14.5; expected a whole number at least 1'),
+        ('budget', 14.5, 'budget is 14.5; expected a whole number from 1 to'),
+        ('episodes', 10**9, 'episodes is 1000000000; expected a whole number from 1 to 1000000'),
+        ('learner', 'a, b', "learner is 'a, b'; expected module:Class"),
+        ('trl_suite', None, 'trl_suite is None; expected a string'),
         ('budget', 4, r'samples\[0\] is \[5, 0, 0\], in total 5; .* at most 4, the budget'),
-        ('seed', -1, 'seed is -1; expected a whole number at least 0'),
+        ('seed', -1, 'seed is -1; expected a whole number from 0 to'),
         ('initial', [0, 0], 'initial: 2 entries; expected 3 numbers'),
         ('scores', [], 'scores: 0 stages; expected 3'),
         ('scores[1]', [0.1, 0.2], r'scores\[1\]: 2 entries; expected 3 numbers'),
@@ -494,7 +546,7 @@ class ResultTest(RunCase):
     def test_every_edit_changes_the_digest(self, name):
         """Also of entries that no metric uses."""
         sequences.check(self.result)
-        value = 'other' if name in ('learner', 'trl_suite') else 1
+        value = 'other:Learner' if name in ('learner', 'trl_suite') else 1
         edited = {**changed(self.result, name, value), 'digest': self.result['digest']}
         with self.assertRaisesRegex(ValueError, 'digest is .* changed after the run'):
             sequences.check(edited)
@@ -582,12 +634,10 @@ class LearnerTest(CommandTest):
             self.output(command, 'check', path),
             f'{path}: my_learner:Nothing, {name}, .*{made}: not comparable: budget is {budget}, not',
         )
-        forged = changed(result, 'learner', '\x1b]0;title\x07a\nvalid and comparable')
+        forged = changed(result, 'cpu', '\x1b]0;title\x07a\nvalid and comparable')
         pathlib.Path('forged.json').write_text(json.dumps(forged))
         told = self.output(command, 'check', 'forged.json')
-        self.assertStartsWith(
-            told, rf'forged.json: \x1b]0;title\x07a\nvalid and comparable, {name}'
-        )
+        self.assertIn(r'cpu \x1b]0;title\x07a\nvalid and comparable: not comparable', told)
         self.assertEqual(told.count('\n'), 1)
         text = pathlib.Path(path).read_text().replace(f'"budget": {budget}', '"budget": 101')
         pathlib.Path('edited.json').write_text(text)

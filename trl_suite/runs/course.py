@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from typing import Any
 
 import numpy as np
 
 from trl_suite.registry import catalogue
+from trl_suite.registry.build import build_task
 from trl_suite.registry.spec import EnvSpec
+from trl_suite.util.options import checked
 
 FIRST_TEST_SEED = 2**31  # smaller seeds are for training
 EPISODES = 32  # per test and environment
@@ -26,7 +30,8 @@ class Course:
       step_limit: control steps after which an episode is truncated; by default those of the ids.
 
     Raises:
-      ValueError: an id is unknown (the message has the closest matches) or occurs twice.
+      ValueError: an id is unknown (the message has the closest matches) or occurs twice, or the name
+        is no string.
     """
 
     name: str
@@ -36,6 +41,7 @@ class Course:
     step_limit: int | None = None
 
     def __post_init__(self) -> None:
+        checked('name', self.name, str)
         object.__setattr__(self, 'ids', tuple(catalogue.find(id).id for id in self.ids))
         if len(set(self.ids)) < len(self.ids):
             raise ValueError(
@@ -55,6 +61,19 @@ class Course:
         spec = catalogue.find(id)
         return dataclasses.replace(spec, step_limit=self.step_limit or spec.step_limit)
 
+    def check_alike(self) -> None:
+        """Checks that one network fits all environments.
+
+        Raises:
+          ValueError: one has other blocks of observations or other actions than the first.
+        """
+        for id in self.ids[1:]:
+            if _layout(id) != _layout(self.ids[0]):
+                raise ValueError(
+                    f'{self.name!r}: {id} has other observations or actions than {self.ids[0]}; '
+                    'expected environments that one network fits'
+                )
+
     def left(self, number: int, budget: int, samples: list[list[int]]) -> int:
         """Returns how many samples may be taken in a stage.
 
@@ -68,6 +87,13 @@ class Course:
         return budget * (number - first + 1) // self.parts - taken
 
 
+@functools.cache
+def _layout(id: str) -> tuple[Any, ...]:
+    """Returns the blocks of observations and the names of actions of an environment."""
+    task = build_task(catalogue.find(id))
+    return list(task.blocks.items()), list(task.action_map.names)
+
+
 def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
     """Returns seeds for training, integers in [0, 2**31), for `VectorEnvironment`.
 
@@ -75,6 +101,7 @@ def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
       count: number of seeds.
       seed: seed from which these seeds are drawn, e.g. (run, stage).
     """
+    checked('count', count, int, at_least=0, at_most=2**32)
     drawn = np.random.SeedSequence(seed).generate_state(count, np.uint32)
     return (drawn % FIRST_TEST_SEED).tolist()
 

@@ -27,9 +27,12 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from trl_suite import evaluation
+from trl_suite.registry import catalogue
 from trl_suite.runs import stage
 from trl_suite.runs.course import EPISODES, Course
 from trl_suite.util import errors, files
@@ -37,6 +40,8 @@ from trl_suite.util.options import checked
 
 ROWS = ('scores', 'samples', 'curves', 'seconds')  # lists with one entry per stage
 MADE_WITH = ('mujoco', 'cpu')
+MOST_SAMPLES = LARGEST_SEED = 2**53  # whole numbers that JSON's readers agree on
+LEARNER = re.compile(r'[\w.]+:[\w.<>]+')  # module and class, as Python names them
 
 
 def digest(result: dict[str, Any]) -> str:
@@ -72,8 +77,9 @@ class Format:
         """The fields of settings, with their types and bounds."""
         return {
             'learner': (str, {}), self.field: (str, {}), 'ids': (list[str], {}),
-            'budget': (int, {'at_least': 1}), 'episodes': (int, {'at_least': 1}),
-            'seed': (int, {'at_least': 0}),
+            'budget': (int, {'at_least': 1, 'at_most': MOST_SAMPLES}),
+            'episodes': (int, {'at_least': 1, 'at_most': evaluation.MOST_EPISODES}),
+            'seed': (int, {'at_least': 0, 'at_most': LARGEST_SEED}),
         }  # fmt: skip
 
     @property
@@ -82,11 +88,13 @@ class Format:
         return ('format', 'trl_suite', *self.settings, 'initial', *ROWS, 'digest')
 
     def get(self, name: str) -> Course:
-        """Returns a course of the benchmark by its name.
+        """Returns a course of the benchmark by its name; one with the name of an id also by its aliases.
 
         Raises:
           ValueError: an unknown name; the message has the closest matches.
         """
+        if name in catalogue.ALIASES:
+            name = catalogue.ALIASES[name].id
         errors.check_known(f'{self.field} of the benchmark', self.courses, name)
         return self.courses[name]
 
@@ -132,8 +140,10 @@ class Format:
                 raise ValueError(f'{name} is missing{hint}')
         for name, (kind, bounds) in self.settings.items():
             checked(name, result[name], kind, **bounds)
-        for name in optional:
+        for name in ('trl_suite', *optional):
             checked(name, result.get(name, ''), str)
+        if not LEARNER.fullmatch(result['learner']):
+            raise ValueError(f'learner is {result["learner"]!r}; expected module:Class')
         course = self.course_of(result)
         if result['ids'] != list(course.ids):
             raise ValueError(f'ids is {result["ids"]}; expected {list(course.ids)}')

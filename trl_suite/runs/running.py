@@ -20,7 +20,7 @@ from trl_suite import evaluation, policies
 from trl_suite.runs import results
 from trl_suite.runs.course import EPISODES, Course, test_seeds
 from trl_suite.runs.stage import Stage
-from trl_suite.util import files, machine
+from trl_suite.util import errors, files, machine
 from trl_suite.util.options import checked
 
 SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
@@ -106,9 +106,15 @@ class Benchmark(results.Format):
         """
         course = self.get(course) if isinstance(course, str) else course
         budget = min(self.budgets.values()) if budget is None else budget
-        budget = checked('budget', budget, int, at_least=course.parts, at_most=2**53)
+        budget = checked('budget', budget, int, at_least=course.parts, at_most=results.MOST_SAMPLES)
         episodes = checked('episodes', episodes, int, at_least=1, at_most=evaluation.MOST_EPISODES)
-        seed = checked('seed', seed, int, at_least=0, at_most=2**53)
+        seed = checked('seed', seed, int, at_least=0, at_most=results.LARGEST_SEED)
+        if self.courses.get(course.name, course) != course:
+            raise ValueError(
+                f'{course.name!r} is a {self.field} of the benchmark with other contents; expected '
+                'another name'
+            )
+        course.check_alike()
         count = len(course.stages)
         stages = checked(
             'stages', count if stages is None else stages, int, at_least=1, at_most=count
@@ -225,9 +231,9 @@ class Benchmark(results.Format):
                 f'{stored.name}: one of the two was changed after the run'
             )
         course = self.course_of(result)
-        again = self.scores(
-            course, policies.load(stored), result['episodes'], result['seed'], num_threads
-        )
+        policy = policies.load(stored)
+        with errors.naming(path):
+            again = self.scores(course, policy, result['episodes'], result['seed'], num_threads)
         same = all(result.get(name) == value for name, value in machine.made_with().items())
         allowed = 0.0 if same else TOLERANCE
         if not np.allclose(again, result['scores'][-1], rtol=0, atol=allowed):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from collections.abc import Sequence as Numbers
 from typing import Any
 
 import numpy as np
 
-from trl_suite.environments.arguments import Ids, unique_ids
-from trl_suite.environments.vector import Step, VectorEnvironment
+from trl_suite.environments.arguments import Ids, given_ids, unique_ids
+from trl_suite.environments.vector import MOST_ENVS, Step, VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.runs.course import FIRST_TEST_SEED, Course, train_seeds
@@ -80,6 +81,7 @@ class Stage:
         errors.check_known('environment of the run', self.ids, id)
         if 'seed' in options:
             raise ValueError('seed: expected none, since the stage draws it from that of the run')
+        checked('num_envs', num_envs, int, at_least=1, at_most=MOST_ENVS)
         seeds = train_seeds(num_envs, (self.seed, self.number, next(self._made)))
         options = {'num_threads': self._num_threads, **options}
         return _Counted(
@@ -108,16 +110,17 @@ class Stage:
         self._over = True
 
     def record(self, task: int, returns: np.ndarray) -> None:
-        """Records the scores of episodes of the environment to be learnt, (k,)."""
+        """Records the scores of episodes of the environment to be learnt, (k,); NaN is unknown."""
         if self.ids[task] == self.id:
             now = int(self.samples.sum())
-            self._returns += [(now, float(each)) for each in returns]
+            self._returns += [(now, float(each)) for each in returns if not np.isnan(each)]
 
     def curve(self) -> list[float | None]:
         """Returns the learning curve: scores of training episodes, with exploration noise.
 
         `POINTS` numbers, the mean over episodes that ended in each part of the budget, None where
-        none did. Only episodes of the environment to be learnt count.
+        none did. Only episodes of the environment to be learnt count, and of these only those with a
+        step limit that were not continued from a state of `get_state`.
         """
         parts: list[list[float]] = [[] for _ in range(POINTS)]
         for samples, score in self._returns:
@@ -132,23 +135,27 @@ class _Counted(VectorEnvironment):
         self, stage: Stage, task: int, spec: EnvSpec, num_envs: int, **options: Any
     ) -> None:
         self._stage, self._number = stage, task
-        self._sums = np.zeros(num_envs)
+        self.sums = np.zeros(num_envs)  # of the rewards of each episode so far
         super().__init__(spec, num_envs, **options)
 
     def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
         asked = self.num_envs if env_ids is None else len(unique_ids(env_ids, self.num_envs))
         self._stage.spend(self._number, asked)
-        step = super().step(action, env_ids)
-        self._sums += step.reward
+        try:
+            step = super().step(action, env_ids)
+        except BaseException:
+            self._stage.samples[self._number] -= asked
+            raise
+        self.sums += step.reward
         ended = step.terminated | step.truncated
         if ended.any():
-            self._stage.record(self._number, self._sums[ended] / (self.spec.step_limit or 1))
-            self._sums[ended] = 0
+            self._stage.record(self._number, self.sums[ended] / (self.step_limit or np.nan))
+            self.sums[ended] = 0
         return step
 
     def reset(self, env_ids: Ids = None, seed: Any = None, level: Any = None) -> Any:
         observation = super().reset(env_ids, seed, level)
-        self._sums[unique_ids(env_ids, self.num_envs)] = 0
+        self.sums[unique_ids(env_ids, self.num_envs)] = 0
         return observation
 
     def seed(self, seed: int | Numbers[int] | None, env_ids: Ids = None) -> None:
@@ -161,8 +168,31 @@ class _Counted(VectorEnvironment):
             raise ValueError('seed is None; expected seeds, so that the run can be repeated')
         kind = Numbers[int] if np.ndim(seed) else int
         seeds = checked('seed', seed, kind, at_least=0)
-        if np.max(seeds) >= FIRST_TEST_SEED:
-            raise ValueError(
-                f'seed {np.max(seeds)} is for tests; expected training seeds, below {FIRST_TEST_SEED}'
-            )
+        _check_training(seeds)
         super().seed(seeds if np.ndim(seed) else train_seeds(self.num_envs, seeds), env_ids)
+
+    def set_state(self, state: dict[str, Any], env_ids: Ids = None) -> None:
+        """Restores a state as `VectorEnvironment.set_state`.
+
+        Raises:
+          ValueError: a simulation of the state has a seed for tests.
+        """
+        _check_training(state.get('seeds', ()) if isinstance(state, Mapping) else ())
+        super().set_state(state, env_ids)
+        self.sums[unique_ids(env_ids, self.num_envs)] = np.nan
+
+    def copy_from(
+        self, other: VectorEnvironment, other_ids: Numbers[int], env_ids: Numbers[int]
+    ) -> None:
+        super().copy_from(other, other_ids, env_ids)
+        ids, sources = given_ids(env_ids, self.num_envs), given_ids(other_ids, other.num_envs)
+        self.sums[ids] = other.sums[sources] if isinstance(other, _Counted) else np.nan
+
+
+def _check_training(seeds: Any) -> None:
+    """Raises ValueError if one of the seeds is for tests."""
+    largest = np.max(seeds, initial=0)
+    if largest >= FIRST_TEST_SEED:
+        raise ValueError(
+            f'seed {largest} is for tests; expected training seeds, below {FIRST_TEST_SEED}'
+        )

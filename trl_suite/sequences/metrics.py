@@ -62,7 +62,7 @@ def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
     found, begin = _matrix(scores), _numbers('initial', initial)
     if begin.shape != found.shape[:1]:
         raise ValueError(f'initial: shape is {begin.shape}; expected {found.shape[:1]}')
-    return _mean(np.diag(found, 1) - begin[1:])
+    return _mean(np.diag(found, 1)) - _mean(begin[1:], 'initial')
 
 
 def forgetting(scores: ArrayLike) -> float:
@@ -97,9 +97,9 @@ def learning_transfer(curve: ArrayLike, reference: ArrayLike) -> float:
       reference: those of training from scratch, (k,).
 
     Raises:
-      ValueError: the shapes differ, no point is in both, or the reference has the maximum throughout.
+      ValueError: a score is no number, the shapes differ, no point is in both, or the reference has the maximum throughout.
     """
-    both = np.asarray(curve, float), np.asarray(reference, float)
+    both = _numbers('curve', curve), _numbers('reference', reference)
     if both[0].shape != both[1].shape or both[0].ndim != 1:
         raise ValueError(f'curve: shape is {both[0].shape}; expected {both[1].shape}, (k,)')
     known = np.isfinite(both[0]) & np.isfinite(both[1])
@@ -122,7 +122,7 @@ def _numbers(name: str, values: ArrayLike) -> np.ndarray:
     return errors.floats(name, values, most=LARGEST, missing=True)
 
 
-def _mean(values: np.ndarray) -> float:
+def _mean(values: np.ndarray, name: str = 'scores') -> float:
     if not np.isfinite(values).all():
-        raise ValueError(f'scores: the metric uses an entry that is not finite: {values.tolist()}')
+        raise ValueError(f'{name}: the metric uses an entry that is not finite: {values.tolist()}')
     return float(values.mean())
