@@ -39,6 +39,7 @@ import tqdm
 from trl_suite import evaluation, policies, suite
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.util import files
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
 SEED = 0  # of evaluations
@@ -317,7 +318,9 @@ def main() -> None:
     parser.add_argument('--picture', type=pathlib.Path, help='a .png for the learning curves')
     arguments = parser.parse_args()
     name, compared = arguments.comparison, COMPARISONS[arguments.comparison]
-    samples = arguments.samples or compared.samples
+    samples = compared.samples if arguments.samples is None else arguments.samples
+    checked('--samples', samples, float, above=0)
+    checked('--seeds', arguments.seeds, list[int], at_least=0)
     path = arguments.json or arguments.runs / f'{name}.json'
     found: dict[str, Any] = {'samples': samples, 'results': {}}
     if path.exists():

@@ -22,6 +22,7 @@ import numpy as np
 import runs
 
 from trl_suite import policies, suite
+from trl_suite.cli.arguments import positive
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.common.footstep_plan import LEFT, RIGHT
 from trl_suite.util.program import begin_script
@@ -160,7 +161,7 @@ def main() -> None:
         '--variant', default='', choices=('', *policies.VARIANTS), help='of the reference policy'
     )
     parser.add_argument('--filter', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
-    parser.add_argument('--episodes', type=int, default=100)
+    parser.add_argument('--episodes', type=positive, default=100)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=SECONDS)
     arguments = parser.parse_args()

@@ -27,6 +27,7 @@ from expert import expert, joint_expert
 
 from trl_suite import policies
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
+from trl_suite.cli.arguments import positive
 from trl_suite.registry import catalogue
 from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import errors
@@ -126,7 +127,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('pattern', nargs='?', default='PD_Biped3D_*', help='of ids')
     parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
-    parser.add_argument('--episodes', type=int, default=EPISODES)
+    parser.add_argument('--episodes', type=positive, default=EPISODES)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--controller', help='footstep controller, instead of the default')
     arguments = parser.parse_args()

@@ -18,6 +18,7 @@ import train_all
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 
 
@@ -52,6 +53,7 @@ def main() -> None:
     parser.add_argument('ids', nargs='*', metavar='ID', help='default: all')
     arguments = parser.parse_args()
     every, evaluate = REFERENCES[arguments.reference]
+    errors.check_known(f'environment of {arguments.reference}', every, *arguments.ids)
     for id_ in arguments.ids or every:
         found = evaluate(id_)
         print(f'{id_}: {found["distance"]:.1f} m', flush=True)

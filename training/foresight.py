@@ -23,6 +23,7 @@ import tqdm
 from gait_bench import position
 
 from trl_suite import suite
+from trl_suite.cli.arguments import positive
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
@@ -75,12 +76,13 @@ def search(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('ids', nargs='+', metavar='ID', help='ids of environments')
-    parser.add_argument('--episodes', type=int, default=1, help='number of terrains')
+    parser.add_argument('--episodes', type=positive, default=1, help='number of terrains')
     parser.add_argument('--metres', type=float, default=30.0, help='distance that is enough, m')
     parser.add_argument('--budget', type=float, default=6e3, help='cycles for each search')
     parser.add_argument('--seed', type=int, default=runs.EVALUATION_SEED + 2)
     arguments = parser.parse_args()
     checked('--metres', arguments.metres, float, above=0)
+    checked('--budget', arguments.budget, float, at_least=1)
     for name in arguments.ids:
         id_, begin = suite.find(name).id, time.process_time()
         learn_gaits.environments_of(id_, learn_gaits.Settings())  # it has a gait

@@ -53,6 +53,7 @@ from trl_suite.cli.arguments import positive
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -393,8 +394,9 @@ class Learner:
         line, *_ = policy.networks[0]
         if line is None or not np.array_equal(policy.columns, self.columns):
             raise ValueError(
-                f'the network of {policy.id} has other inputs than that of {self.ids[0]}; expected one that '
-                'learn_gaits.py trained for the same character'
+                f'the network of {policy.id} has {len(policy.columns)} inputs, that of {self.ids[0]} '
+                f'{len(self.columns)}; expected one that learn_gaits.py trained for the same character '
+                'with the same setting view'
             )
         known = self.choices[: len(policy.choices)]
         if policy.choices.shape != known.shape or (
@@ -739,11 +741,13 @@ def train(
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
     Raises:
-      ValueError: the checkpoint is damaged, or has other settings; only those in `_CHANGEABLE` may
-        differ.
+      ValueError: there are too few samples to learn from; or the checkpoint is damaged, or has other
+        settings; only those in `_CHANGEABLE` may differ.
       RuntimeError: another process trains in the folder.
     """
     environments_of(id_, settings)  # before there is a folder
+    least = max(settings.steps * settings.num_envs, 0 if settings.start else settings.begin)
+    checked('samples', settings.samples, float, at_least=least)
     with runs.only_run(folder):
         return _train(id_, seed, settings, folder, threads)
 

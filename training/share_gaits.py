@@ -23,6 +23,7 @@ import runs
 import train_all
 
 from trl_suite import evaluation, policies
+from trl_suite.cli.arguments import positive
 from trl_suite.util.program import begin_script
 
 
@@ -68,7 +69,7 @@ def main() -> None:
     parser.add_argument(
         'ids', nargs='+', metavar='ID', help='environments in which it is evaluated'
     )
-    parser.add_argument('--episodes', type=int, default=train_all.GAIT_EPISODES)
+    parser.add_argument('--episodes', type=positive, default=train_all.GAIT_EPISODES)
     parser.add_argument('--preferences', type=float, nargs='+', default=[0.0])
     parser.add_argument('--threads', type=int, default=1, help='0: all cores')
     arguments = parser.parse_args()

@@ -50,6 +50,7 @@ from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.util import errors
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
 EPISODES, SEED = 50, 0  # of the published evaluation
@@ -169,7 +170,10 @@ def train(id_: str, seed: int, output: pathlib.Path, samples: float | None, mach
     folder = output / id_ / f'seed_{seed}'
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / 'log.txt', 'a') as log:
-        subprocess.run(command, check=True, stdout=log, stderr=log)
+        ended = subprocess.run(command, check=False, stdout=log, stderr=log)
+    if ended.returncode:
+        *_, last = (folder / 'log.txt').read_text().split('\n')[:-1] or ['']
+        raise RuntimeError(f'{script.name} ended with status {ended.returncode}: {last}')
     return measured(id_, folder, machine, begin)
 
 
@@ -332,7 +336,14 @@ def parsed(words: Sequence[str] | None) -> argparse.Namespace:
         '--address', help="of Ray: 'auto', or HOST:PORT; default: this machine's cluster, or itself"
     )
     parser.add_argument('--machine', default='', help='description of the machine in the results')
-    return parser.parse_args(words)
+    chosen = parser.parse_args(words)
+    checked('--jobs', chosen.jobs, int, at_least=1)
+    checked('--samples', chosen.samples, float | None, above=0)
+    for seed in chosen.seeds:
+        errors.check_known('seed of the runs', map(str, COMPARED_SEEDS), str(seed))
+    if '://' in chosen.runs and not chosen.ray:
+        raise ValueError(f'--runs is {chosen.runs!r}; expected a folder, or a URL with --ray')
+    return chosen
 
 
 def main(words: Sequence[str] | None = None) -> None:

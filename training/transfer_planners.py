@@ -23,6 +23,7 @@ import runs
 from settings import Settings, settings_for
 
 from trl_suite import policies, suite
+from trl_suite.cli.arguments import positive
 from trl_suite.util.program import begin_script
 
 SAMPLES = 2.4e5  # footsteps
@@ -55,7 +56,7 @@ def main() -> None:
     parser.add_argument('--each', action='store_true', help='train with each, instead of selecting')
     parser.add_argument('--samples', type=float, default=SAMPLES, help='footsteps')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--episodes', type=int, default=32, help='of the evaluation')
+    parser.add_argument('--episodes', type=positive, default=32, help='of the evaluation')
     parser.add_argument('--enter', action='store_true', help='write results to trained/plans.json')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     arguments = parser.parse_args()

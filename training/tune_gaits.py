@@ -51,6 +51,7 @@ from gait_bench import FRICTION, HORIZON, Bench, nudged, position, stored, vecto
 from trl_suite import controllers
 from trl_suite.controllers import Parameters
 from trl_suite.util import errors, files
+from trl_suite.util.libraries import library
 from trl_suite.util.program import begin_script
 
 # Of `default`: horizon of the first generations, s, and their number; frictions of the starts, in turn;
@@ -164,8 +165,7 @@ def search(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Returns the mean of the last generation, and the best gaits of the last ones, (m, P)."""
-    import cma
-
+    cma = library('cma', 'trl_suite[tune]')
     _, _, _, digits, finalists_ = DEFAULT if arguments.action == 'default' else OTHER
 
     def vectors(candidates: Sequence[np.ndarray], rounded: bool) -> np.ndarray:

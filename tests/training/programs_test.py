@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pathlib
+import sys
 from types import SimpleNamespace
 from unittest import mock
 
@@ -15,6 +16,7 @@ import evaluate_plans
 import evaluate_references
 import expert
 import generalist
+import learn_gaits
 import networks
 import numpy as np
 import ppo
@@ -538,13 +540,36 @@ class TrimTest(FolderTest):
         self.assertEqual(run['settings'], expected)
 
 
-class ProgramsTest(parameterized.TestCase):
+class ProgramsTest(FolderTest):
     def test_every_program_ends_errors_in_one_line(self):
         folder = pathlib.Path(ppo.__file__).parent
         for path in (*folder.glob('*.py'), *folder.with_name('examples').glob('*.py')):
             text = path.read_text()
             if '__main__' in text or ('.parse_args(' in text and path.parent != folder):
                 self.assertRegex(text, r'(?m)^(    )?begin_script\(\)$', path.name)
+
+    @parameterized.parameters(
+        (train_all, '--jobs 0', '--jobs is 0; expected a whole number at least 1'),
+        (train_all, '--samples -1', '--samples is -1.0; expected'),
+        (train_all, '--seeds -1', "unknown seed of the runs '-1'"),
+        (train_all, '--runs s3://a/b', "--runs is 's3://a/b'; expected a folder, or a URL with --ray"),
+        (compare, 'actions --samples 0', '--samples is 0.0; expected a number above 0'),
+        (compare, 'actions --seeds -1', r'--seeds is \[-1\]; expected'),
+        (evaluate_references, 'transfer Foo', "unknown environment of transfer 'Foo'"),
+        (
+            evaluate_references, 'default_gaits PD_Biped2D_Flat-v0',
+            "unknown environment of default_gaits 'PD_Biped2D_Flat-v0'",
+        ),
+        (learn_gaits, 'FSM_Hopper2D_Terrain_Gaps-v0 --samples 64', 'samples is 64.0; expected'),
+    )  # fmt: skip
+    def test_bad_arguments_are_named_before_there_is_a_folder(self, module, words, message):
+        with (
+            contextlib.chdir(self.folder),
+            mock.patch.object(sys, 'argv', [module.__name__, *words.split()]),
+            self.assertRaisesRegex(ValueError, message),
+        ):
+            module.main()
+        self.assert_only()
 
 
 class TransferTest(parameterized.TestCase):
