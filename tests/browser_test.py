@@ -179,7 +179,7 @@ class SceneTest(parameterized.TestCase):
             taken.bind(('127.0.0.1', 65535))
             with self.assertRaisesRegex(OSError, 'in use'):
                 web_server.start_server('127.0.0.1', 65535)
-        with self.assertRaises(OSError):
+        with self.assertRaisesRegex(OSError, "host 'nosuch.invalid', port 8080"):
             web_server.start_server('nosuch.invalid', 8080)
 
     def shown(self, id_):
@@ -316,6 +316,28 @@ class BrowserTest(parameterized.TestCase):
         self.assertIn('mine.npz', tell.call_args_list[1].args[0])
         self.assertEqual(viewer._panel._fitted[0].value, 'plane')
         self.assertEqual(viewer._panel._policy.value, policy)
+
+    def test_a_seed_repeats_random_actions(self):
+        viewer = browser.Browser(DOG, 'random', seed=3, port=0)
+        self.addCleanup(web_server.stop_server, viewer._server)
+        found = []
+        for begin in (lambda: None, lambda: viewer.reset(3), lambda: viewer.choose_policy('random')):
+            begin()
+            viewer._serve()
+            for _ in range(5):
+                viewer.session.advance()
+            found.append(viewer.session.total)
+        self.assertEqual(found, found[:1] * 3)
+        with self.assertRaisesRegex(ValueError, r'seed is -1; expected a seed in \[0, 2\*\*32\)'):
+            browser.Browser(DOG, seed=-1, port=0)
+
+    def test_the_button_says_what_it_does(self):
+        viewer = browser.Browser(DOG, 'zero', port=0)
+        self.addCleanup(web_server.stop_server, viewer._server)
+        for playing, label in ((False, 'Play'), (True, 'Pause')):
+            viewer.play(playing)
+            viewer._serve()
+            self.assertEqual(viewer._panel._play.label, label)
 
     def test_browsers_are_told_of_waits_while_it_runs(self):
         viewer = browser.Browser(DOG, 'zero', port=0)

@@ -76,5 +76,6 @@ def _free_port(host: str, port: int) -> int:
                 return number
         except OSError as error:
             if number == last or error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                raise
+                what = f'cannot listen on host {host!r}, port {number}: {error.strerror}'
+                raise OSError(error.errno, what) from None
     return port

@@ -28,6 +28,7 @@ import mujoco
 
 from trl_suite import policies, suite
 from trl_suite.environments import named_policies
+from trl_suite.environments.arguments import check_seed
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene, web_server
@@ -97,11 +98,14 @@ class Browser:
           opened: called when the addresses are known, before the environment is loaded.
 
         Raises:
-          ValueError: an unknown id, policy, option or port, or a policy that does not fit.
+          TypeError: the seed is no integer.
+          ValueError: an unknown id, policy, option or port, a seed out of range, or a policy that does
+            not fit.
           FileNotFoundError: there is no such file.
           ImportError: the extra 'viewer' is not installed.
           OSError: this machine cannot listen on the address.
         """
+        check_seed('seed', seed)
         web_server.load_viser()
         self.playing, self.speed, self.seed = True, 1.0, seed
         self._task_kwargs = {**(task_kwargs or {}), 'random': seed}
@@ -180,6 +184,7 @@ class Browser:
     def play(self, playing: bool) -> None:
         """Runs or pauses the simulation."""
         self.playing = playing
+        self._panel.report(self.session.status(), playing)
 
     @_request
     def step(self) -> None:
@@ -191,7 +196,10 @@ class Browser:
     @_request
     def reset(self, seed: int | None = None) -> None:
         """Starts the next episode, or the first episode of a seed."""
-        self.seed = self.seed if seed is None else seed
+        if seed is not None:
+            check_seed('seed', seed)
+            self.seed = seed
+            self.session.policy = self._acting(self._loaded)
         self.session.reset(seed)
         self._redraw()
 
@@ -291,9 +299,14 @@ class Browser:
         policy.check(environment)
         return lambda time_step: policy(time_step.observation)
 
+    def _acting(self, loaded: Loaded) -> Policy:
+        """Makes the chosen policy anew, so that random actions begin again with the seed."""
+        return self._policy(loaded.policy, loaded.environment, loaded.spec)
+
     def _show(self, loaded: Loaded) -> None:
+        acting = self._acting(loaded)
         self._loaded = loaded
-        self.session = Session(loaded.environment, loaded.policies[loaded.policy], self.seed)
+        self.session = Session(loaded.environment, acting, self.seed)
         self._scene = web_scene.WebScene(self._server, loaded.environment)
         self._panel.show(loaded, self.session)
         self._redraw()
