@@ -69,8 +69,8 @@ POLICIES = {'reference': reference, 'mixed': mixed, 'random': evaluation.random}
 def write(id: str, policy: str, episodes: int, seed: int = 0, num_threads: int = 0) -> str:
     """Writes a data set into Minari's folder, when it is complete.
 
-    It has observations (flat), actions, rewards, terminations, truncations and infos of `gymnasium`'s
-    `trl_suite/ID`, in float32. Its description is JSON: the recipe and the SHA-256 of the recipe.
+    It has observations (flat) and actions, both in float32, rewards, terminations, truncations and infos
+    of `gymnasium`'s `trl_suite/ID`. Its description is JSON: the recipe and the SHA-256 of the recipe.
 
     Args:
       id: id or alias of an environment.

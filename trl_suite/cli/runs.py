@@ -62,7 +62,7 @@ def _add_run(actions: Any, text: str, run: Any, *budgets: str) -> argparse.Argum
     command = add_command(actions, 'run', text, run)
     text = 'class of the learner: CLASS(course, seed), with the methods train(stage) and policy()'
     command.add_argument('--learner', required=True, metavar='MODULE:CLASS', help=text)
-    text = f'samples for each environment: {", ".join(budgets)}, or N'
+    text = f'samples to learn an environment: {", ".join(budgets)}, or N'
     command.add_argument('--budget', default=budgets[0], help=text)
     text = 'episodes per test and environment'
     command.add_argument('--episodes', type=positive, default=32, help=text)
