@@ -130,8 +130,8 @@ def load(character: str, base_actions: str = 'default') -> Parameters:
     errors.check_known('character with a gait', available(), character)
     text = (importlib.resources.files(__package__) / f'{character}.json').read_text()
     data = json.loads(text)
-    if base_actions == 'original':
-        data['base_actions'] = data.get('original_base_actions', data['base_actions'])
+    if base_actions == 'original' and 'original_base_actions' in data:
+        data |= {'base_actions': data['original_base_actions'], 'action_offset': 0}
     return read(data)
 
 

@@ -47,8 +47,8 @@ class GaitConfig(GroundConfig):
     )
     base_actions: str = option(
         'default',
-        "base actions: 'default', or 'original' for those of the papers; the two differ for biped, goat and "
-        'hopper',
+        "base actions: 'default', or 'original' for those of the papers, of which the first is the default "
+        'gait; the two differ for biped, goat and hopper',
         choices=BASE_ACTIONS,
     )
     substeps: int = option(
