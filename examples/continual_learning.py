@@ -37,6 +37,8 @@ class FineTuning:
 
     def learn(self, stage, samples):
         """Trains in simulations that count their samples; more than the budget are refused."""
+        if samples < NUM_ENVS * STEPS:
+            raise ValueError(f'{samples} samples; expected {NUM_ENVS * STEPS} or more, one update')
         environments = stage.environments(NUM_ENVS, autoreset='same_step', dtype=np.float32)
         self.scales = VecNormalize(SuiteVecEnv(environments), norm_reward=False)
         self.scales.obs_rms = self.rms

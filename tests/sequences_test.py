@@ -648,6 +648,11 @@ class LearnerTest(CommandTest):
         status, _, err = run(*arguments, 'my_learner:Greedy')
         self.assertEqual(status, 2)
         self.assertRegex(err, rf'stage 0 \(.*2 more samples; .* at most .*{taken} are')
+        self.assertRegex(err, r'Traceback(.*\n)*.*my_learner.py", line \d+, in train')
+        pathlib.Path('edited.json').unlink()
+        status, printed, err = run(command, 'check', '.')  # the last run has not ended
+        self.assertEqual((status, printed), (0, told))
+        self.assertRegex(err, r'_?\w+.json is left out, since its run has not ended\n$')
 
     def test_list(self):
         out = self.output('sequences', 'list')

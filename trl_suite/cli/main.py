@@ -19,7 +19,8 @@
     trl-suite sequences run plaid_biped --learner my_module:MyLearner --output result.json
     trl-suite sequences check result.json
 
-Invalid input ends with one line on stderr and exit status 2. Each module of `COMMANDS` declares the
+Invalid input ends with one line on stderr and exit status 2, after the traceback of an error in a
+learner's module. Each module of `COMMANDS` declares the
 arguments of its commands, and runs them; the engine is imported only when a command that needs it runs.
 """
 

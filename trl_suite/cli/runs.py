@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import pathlib
 import sys
+import traceback
+from collections.abc import Iterator
 from typing import Any
 
 from trl_suite.cli import engine
@@ -87,6 +90,30 @@ def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
     return paths
 
 
+def _read(benchmark: Any, entries: list[pathlib.Path]) -> Iterator[tuple[pathlib.Path, Any]]:
+    """Yields path and content of results; unfinished ones in folders are left out, with a note."""
+    for path in _results(entries):
+        result = benchmark.read(path, complete=path in entries)
+        if 'metrics' in result:
+            yield path, result
+        else:
+            note = f'trl-suite: {path} is left out, since its run has not ended'
+            print(program.printable(note), file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _shown(learner: str) -> Iterator[None]:
+    """Prints the traceback of errors in a learner's module, given as module:Class, for its author."""
+    module = learner.partition(':')[0]
+    try:
+        yield
+    except program.EXPECTED as error:  # others are shown anyway
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+        if any(frame.f_globals.get('__name__') == module for frame in frames):
+            traceback.print_exc()
+        raise
+
+
 def _list(arguments: argparse.Namespace) -> None:
     benchmark = engine.load('trl_suite.benchmark')
     print(f'{"environment":<36} {"0":>7} {"1":>7} {"limit":>6}  what it tests')
@@ -103,14 +130,15 @@ def _run(arguments: argparse.Namespace) -> None:
     kind = _learner(arguments.learner)
     budget = _budget(arguments.budget, benchmark.BUDGETS)
     folder = arguments.output or pathlib.Path(arguments.learner.rpartition(':')[2])
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for course in courses:
         _warn(benchmark.BENCHMARK, course, budget, arguments)
         path = folder / f'{course.name}_s{arguments.seed}.json'
-        result = benchmark.run(
-            course, kind(course, arguments.seed), budget, path, arguments.episodes,
-            arguments.seed, arguments.threads, progress=True,
-        )  # fmt: skip
+        with _shown(arguments.learner):
+            result = benchmark.run(
+                course, kind(course, arguments.seed), budget, path, arguments.episodes,
+                arguments.seed, arguments.threads, progress=True,
+            )  # fmt: skip
         print(f'{path}: score {result["metrics"]["score"]:.3f}', flush=True)
 
 
@@ -127,10 +155,11 @@ def _run_sequence(arguments: argparse.Namespace) -> None:
     kind = _learner(arguments.learner)
     budget = _budget(arguments.budget, sequences.BUDGETS)
     _warn(sequences.BENCHMARK, sequence, budget, arguments)
-    result = sequences.run(
-        sequence, kind(sequence, arguments.seed), budget, arguments.output, arguments.episodes,
-        arguments.seed, arguments.threads, progress=True, stages=arguments.stages,
-    )  # fmt: skip
+    with _shown(arguments.learner):
+        result = sequences.run(
+            sequence, kind(sequence, arguments.seed), budget, arguments.output, arguments.episodes,
+            arguments.seed, arguments.threads, progress=True, stages=arguments.stages,
+        )  # fmt: skip
     for id, row in zip(sequence.ids, result['scores'], strict=False):
         print(f'after {id:34}', *(f'{score:.3f}' for score in row))
     for name, value in result.get('metrics', {}).items():
@@ -150,8 +179,7 @@ def _warn(benchmark: Any, course: Any, budget: int, arguments: argparse.Namespac
 def _check(arguments: argparse.Namespace) -> None:
     """Checks results, and prints one line for each."""
     benchmark = engine.load(f'trl_suite.{arguments.benchmark}').BENCHMARK
-    for path in _results(arguments.entries):
-        result = benchmark.read(path)
+    for path, result in _read(benchmark, arguments.entries):
         notes = benchmark.departures(result)
         comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
         made = ''.join(f', {name} {result[name]}' for name in ('mujoco', 'cpu') if name in result)
@@ -165,7 +193,7 @@ def _check(arguments: argparse.Namespace) -> None:
 def _report(arguments: argparse.Namespace) -> None:
     report = engine.load('trl_suite.benchmark.report')
     benchmark = engine.load('trl_suite.benchmark')
-    results = [benchmark.read(path) for path in _results(arguments.entries)]
+    results = [result for _, result in _read(benchmark, arguments.entries)]
     found = report.report(results)
     print('\n'.join(map(program.printable, report.table(found).split('\n'))))
     if arguments.json is not None:
@@ -203,7 +231,8 @@ def _learner(text: str) -> Any:
         raise ValueError(f'--learner is {text!r}; expected module:Class')
     sys.path.insert(0, os.getcwd())
     try:
-        found = importlib.import_module(module)
+        with _shown(text):
+            found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name not in (module, module.partition('.')[0]):
             raise
