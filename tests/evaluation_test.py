@@ -135,6 +135,17 @@ class EvaluateTest(parameterized.TestCase):
         found = evaluation.evaluate(GAPS, make(GAPS), 4, task_kwargs={'time_limit': 0.1})
         self.assertEqual((found['step_limit'], found['lengths']), (3, [3] * 4))
         self.assertEqual(found['normalized_return'], found['return'] / 3)
+        with self.assertRaisesRegex(
+            ValueError, 'expected a step_limit.* since steps of FSM_.* differ'
+        ):
+            options = {'time_limit': 3.0}
+            evaluation.evaluate(
+                'FSM_Hopper2D_Terrain_Gaps-v0',
+                evaluation.zero,
+                1,
+                task_kwargs=options,
+                factory=True,
+            )
 
     def test_a_fall_in_the_last_step_is_not_full_length(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 3, factory=True)

@@ -178,7 +178,12 @@ def _run(
     )
     id_, step_limit = environments.spec.id, environments.step_limit
     try:
-        if environments.time_limit < math.inf and not environments.task.steps_vary:
+        if environments.time_limit < math.inf:
+            if environments.task.steps_vary:
+                raise ValueError(
+                    f'time_limit is {environments.time_limit}; expected a step_limit, by which returns '
+                    f'are divided, since steps of {id_} differ in duration'
+                )
             steps = math.ceil(environments.time_limit / environments.control_timestep - 1e-6)
             step_limit = steps if step_limit is None else min(step_limit, steps)
         if step_limit is None:
