@@ -321,7 +321,11 @@ class BrowserTest(parameterized.TestCase):
         viewer = browser.Browser(DOG, 'random', seed=3, port=0)
         self.addCleanup(web_server.stop_server, viewer._server)
         found = []
-        for begin in (lambda: None, lambda: viewer.reset(3), lambda: viewer.choose_policy('random')):
+        for begin in (
+            lambda: None,
+            lambda: viewer.reset(3),
+            lambda: viewer.choose_policy('random'),
+        ):
             begin()
             viewer._serve()
             for _ in range(5):

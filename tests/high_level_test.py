@@ -715,6 +715,7 @@ REFUSED = (
     ({'terrain_observation': None}, 'terrain_observation is None; expected a string or a list of strings'),
     ({'goal_reached': [1]}, r'goal_reached is \[1\]; expected None or a number above 0, in m'),
     ({'terrain_level': True}, 'terrain_level is True; expected a number'),
+    ({'terrain_level': 1}, 'terrain_level is 1; expected a number from 0 to 0'),
 )  # fmt: skip
 ANSWERS = (  # of a controller for one simulation, and the message
     (np.zeros((1, 16)), r'shape \(1, 16\); expected \(1, 17\)'), (np.zeros((1, 18)), r'shape \(1, 18\)'),

@@ -25,6 +25,7 @@ import numpy as np
 from trl_suite import policies
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.characters import CharacterSpec
+from trl_suite.util import errors
 
 Function = Callable[[np.ndarray], Any]
 
@@ -53,7 +54,8 @@ class Controller:
         self._size = len(action_map)
         if self.policy is None:
             return
-        self.policy.check(types.SimpleNamespace(blocks=blocks, action_map=action_map))
+        with errors.naming(f'controller {self.name}'):
+            self.policy.check(types.SimpleNamespace(blocks=blocks, action_map=action_map))
         trained = self.policy.info.get('character')
         own = character.digest
         if trained is not None and trained != own:

@@ -83,7 +83,11 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             shared[name] = given.pop(name)
     common = variation.CommonOptions.parse(spec.id, shared)
     realism.check(common.actuators, spec.actuation)
-    type_, config_type, others = task_type(spec), config_of(spec), (*names, 'random')
+    type_, config_type, others = (
+        task_type(spec),
+        config_of(spec),
+        (*names, 'step_limit', 'time_limit', 'random'),
+    )
     if config_type is None:
         known, config = task_options(spec), None
         if not known.keys() >= given.keys():
@@ -98,7 +102,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
-    parts = _parts(spec, type_, common.actuators, getattr(config, 'face_length', None))
+    parts = _parts(spec, type_, common.actuators, config)
     if type_ is not None:
         task = type_.make(parts, config)
     else:
@@ -126,12 +130,13 @@ def _policy(name: str, source: Any) -> Any:
     return policies.reference(find(source).id)
 
 
-def _parts(
-    spec: EnvSpec, type_: TaskType | None, actuators: Actuators, face_length: float | None
-) -> Parts:
+def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators, config: Any) -> Parts:
     """Makes the parts of the task."""
     character = character_of(spec)
-    ground = terrains.load(spec.part('terrain')).with_faces(face_length)
+    ground = terrains.load(spec.part('terrain')).with_faces(getattr(config, 'face_length', None))
+    ground.parameters(
+        getattr(config, 'terrain_level', 0.0)
+    )  # refuses a level that it does not have
     if ground.spatial != character.spatial:
         presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
         raise ValueError(

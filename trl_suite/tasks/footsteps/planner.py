@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from trl_suite.motion import quaternion
 from trl_suite.tasks.common.footstep_plan import SIDE, FootstepPlan
 from trl_suite.tasks.footsteps.rules import FootstepState
 from trl_suite.tasks.tracking import TrackingTask
-from trl_suite.util.options import Config, Range, option
+from trl_suite.util.options import Config, Range, option, within
 
 # Meanings of options of all tasks that follow footstep plans.
 MAX_LANDING_ERROR = (
@@ -22,13 +23,14 @@ FOOTSTEP_SCALE = 'factor of the squared landing error in the reward; larger valu
 ROOT_TURN_LIMIT = 1.2  # rad; largest turn of a plan relative to the root
 NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading
 GOAL_REACHED = 1.0  # m; a nearer goal is redrawn
+FAR = 10.0  # m; largest length and width of a step
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StraightPlans(Config):
     """Options for drawing plans in the plane."""
 
-    length: Range = option(Range(0.4, 0.4), 'length of a step', unit='m', at_least=0)
+    length: Range = option(Range(0.4, 0.4), 'length of a step', **within(0, FAR, 'm'))
     change: float = option(
         0.1, 'probability that the length of a step is redrawn', at_least=0, at_most=1
     )
@@ -43,21 +45,23 @@ class Plans(Config):
     heading, and by its width to the side of the foot. With `react`, both follow the foot that landed.
     """
 
-    length: Range = option(Range(0.5, 0.5), 'length of a step', unit='m', at_least=0)
+    length: Range = option(Range(0.5, 0.5), 'length of a step', **within(0, FAR, 'm'))
     width: Range = option(
-        Range(0.15, 0.15), 'distance between the feet to the side', unit='m', at_least=0
+        Range(0.15, 0.15), 'distance between the feet to the side', **within(0, FAR, 'm')
     )
     change: float = option(
         0.1, 'probability that length and width of a step are redrawn', at_least=0, at_most=1
     )
     turn: float = option(
         0.25,
-        'standard deviation of the change of heading from one step to the next',
-        unit='rad',
-        at_least=0,
+        'standard deviation of the change of heading from one step to the next, without goals',
+        **within(0, 2 * math.pi, 'rad'),
     )
     sharp: float = option(
-        0.1, 'probability of a sharp turn instead, drawn from [-pi, pi)', at_least=0, at_most=1
+        0.1,
+        'probability of a sharp turn instead, drawn from [-pi, pi), without goals',
+        at_least=0,
+        at_most=1,
     )
     from_root: float = option(
         0.0,
@@ -66,13 +70,12 @@ class Plans(Config):
         at_least=0,
         at_most=1,
     )
-    root_length: Range = option(Range(0.2, 0.7), 'length of its steps', unit='m', at_least=0)
-    root_width: Range = option(Range(0.08, 0.28), 'width of its steps', unit='m', at_least=0)
+    root_length: Range = option(Range(0.2, 0.7), 'length of its steps', **within(0, FAR, 'm'))
+    root_width: Range = option(Range(0.08, 0.28), 'width of its steps', **within(0, FAR, 'm'))
     root_turn: float = option(
         0.3,
         f'standard deviation of its turn from the current heading; clipped to +-{ROOT_TURN_LIMIT}',
-        unit='rad',
-        at_least=0,
+        **within(0, 2 * math.pi, 'rad'),
     )
     stop: float = option(
         0.0,

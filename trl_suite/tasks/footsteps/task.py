@@ -88,7 +88,7 @@ class SpatialFootstepsConfig(MirroredConfig):
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     grace_period: float = option(
         0.0,
-        'time after a push or a sharp turn in which landing errors do not end the episode',
+        'time after a push or a sharp turn in which max_landing_error does not end the episode',
         unit='s',
         at_least=0,
     )

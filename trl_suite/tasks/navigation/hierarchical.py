@@ -69,7 +69,8 @@ class HierarchicalConfig(GroundConfig):
         CONTROLLER,
         (
             'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
-            'of its file, or a function; or a list of them, of which every action selects one'
+            'of its file, or a function; or a list of them, of which every action selects one; it does not act '
+            "with the interface 'frame'"
         ),
         policy=True,
     )
@@ -81,7 +82,7 @@ class HierarchicalConfig(GroundConfig):
     )
     terrain_observation: str | Collection[str] = terrain_maps('height')
     step_length: float = option(
-        STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0
+        STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0, at_most=10
     )
     target_speed: float = option(
         1.0,
