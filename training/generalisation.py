@@ -19,7 +19,7 @@ from trl_suite.util.program import begin_script
 IDS = (
     'PD_Biped2D_Mixed_Terrain-v0', 'PD_Dog2D_Mixed_Terrain-v0', 'PD_Biped3D_Imitate-Stairs_Terrain-v0',
 )  # fmt: skip
-COUNTS = (10, 100, 1000, 2**31)  # levels of training; the last is as good as no limit
+COUNTS = (1, 10, 100, 1000, 2**31)  # levels of training; the last is as good as no limit
 OTHERS = (2**31, 2**31)  # levels of tests
 EPISODES = 256
 FILE = pathlib.Path(__file__).resolve().parents[1] / 'docs' / 'benchmark' / 'levels.json'
