@@ -250,8 +250,10 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         (
             'Planning footsteps',
             'By `training/evaluate_plans.py`: episodes of 200 s, seed 0, with the scripted and the reference policy, '
-            'and the expert that was imitated. *Reward*: normalised, 0 after a fall. *Speed*: towards the goal '
-            '(soccer: of the ball), m/s. *Trail*: median distance along it, m. *Ball at goal*: share of the time.',
+            'and the expert that was imitated. *With ID*: on another footstep controller; *fine-tuned*: trained '
+            'further on it, not shipped; *one planner*: on several, see '
+            '[DeepLoco](reports/deeploco.md#a-planner-on-another-controller). *Reward*: normalised, 0 after a fall. '
+            '*Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: median distance along it, m. *Ball at goal*: share of the time.',
             PLAN_COLUMNS, plan_rows('hierarchical'),
         ),
         (
@@ -259,7 +261,8 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'The same program and episodes. The policies imitate planned footsteps and the controller that tracks '
             'them; with PPO alone: [DeepLoco](reports/deeploco.md#without-hierarchy). The reward includes '
             'imitation of the clip. Goals are reached within 0.5 m instead of 1 m, and on the trail they are one '
-            'segment of 2 m ahead instead of up to ten; in soccer, speed is towards the ball.',
+            'segment of 2 m ahead instead of up to ten, so that the speed towards them says little there; in soccer, '
+            'speed is towards the ball.',
             PLAN_COLUMNS, plan_rows('flat_control'),
         ),
         (
@@ -277,12 +280,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '# Results',
         f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments: '
         '`suite.reference_policy(id)`. This page is written by `training/results.py` from the '
-        f'{number} runs in `trained/`, which `training/train_all.py` repeats. A `note` in the file of a run says '
-        'where it differs from the settings there. Claims of the papers: [reports](reports/README.md).',
+        f'{number} runs in `trained/`, which `training/train_all.py` repeats. The file of a run has its settings; a '
+        '`note` says where it departed from them. Claims of the papers: [reports](reports/README.md).',
         f'Policies are evaluated without noise, in {train_all.EPISODES} or {train_all.GAIT_EPISODES} episodes (gaits on other '
         'terrains: column *episodes*) that are used neither in training nor to select a policy of the curve. Where '
         'there are several seeds, the best one is shipped; its return is that in episodes that had no part in this choice, '
-        'beside the mean and the number of all seeds. *Return* is '
+        'beside the mean and the number of all seeds. A later run replaces the policy if its score in these episodes '
+        'is higher, so scores of environments that were trained repeatedly are slightly too high. *Return* is '
         'divided by its maximum; the reward is 0 after a fall; the interval is of the episodes that were run, and too '
         'narrow where a fall is so rare that none of them has one. *Complete*: share of episodes that last to the '
         'end (256 steps; planning environments 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
