@@ -577,8 +577,9 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     ('PD_Biped3D_LLC_Bumps_Step-v0', STEPS_ON),
     ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
-    ('PD_Biped3D_LLC_HighKnees_Step-v0', {**STYLED, 'further': STEADIER}),
-    *((f'PD_Biped3D_LLC_{name}_Step-v0', STYLED) for name in ('StraightLegs', 'ForwardLean')),
+    *((f'PD_Biped3D_LLC_{name}_Step-v0', {**STYLED, 'further': STEADIER})
+      for name in ('HighKnees', 'StraightLegs')),
+    ('PD_Biped3D_LLC_ForwardLean_Step-v0', STYLED),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', ONE_SIDED) for name in ('OneStraightLeg', 'SidewaysLean')),
     ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
     ('PD_Biped3D_LLC_Stand_Step-v0', STANDING),
