@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from trl_suite import policies, rendering, suite
-from trl_suite.util import resources
+from trl_suite.util import errors, resources
 from trl_suite.util.program import begin_script
 
 WALK, GROUND, PUSHED = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-v0'
@@ -158,6 +158,7 @@ def main() -> None:
         '--output', type=pathlib.Path, default=pathlib.Path('docs/pictures/realism')
     )
     arguments = parser.parse_args()
+    errors.check_known('picture', PICTURES, *arguments.names)
     arguments.output.mkdir(parents=True, exist_ok=True)
     for name in arguments.names:
         PICTURES[name](arguments.output / f'{name}.png')

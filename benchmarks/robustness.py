@@ -4,8 +4,8 @@
         [--json docs/data/robustness.json] [--page docs/reports/robustness.md]
 
 Every cell has the same seeds, so that terrain and start of an episode are the same with and without
-the disturbance. The JSON file is written after every cell, and an unfinished run is resumed. The
-table of the page has the return divided by that without disturbance.
+the disturbance. The JSON file is written after every cell, and an unfinished run is resumed; cells of
+a policy that is no longer shipped are measured again. The table of the page has the return divided by that without disturbance.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import tqdm
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.util import files
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 IDS = (
@@ -94,22 +95,27 @@ def run(
     step_limit: int | None,
     path: pathlib.Path,
 ) -> dict[str, Any]:
-    """Evaluates all cells that the file does not have yet; returns all, by seed, id and cell."""
+    """Evaluates all cells that the file lacks for the shipped policies; returns all, by seed, id, cell.
+
+    Entry 'of' of a row is the digest of the policy.
+    """
     settings = {'episodes': episodes, 'step_limit': step_limit}
     found: dict[str, Any] = {**settings, 'seeds': {}}
     if path.exists():
         found = files.read_json(path)
         if {name: found[name] for name in settings} != settings:
             raise ValueError(f'{path} has other settings; remove it, or give another --json')
+    shipped = {id_: policies.reference(id_) for id_ in ids}
     jobs = [(seed, id_, *cell) for seed in seeds for cell in cells() for id_ in ids]
     for seed, id_, key, ground, options in tqdm.tqdm(jobs):
-        row = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {})
+        row, policy = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {}), shipped[id_]
+        if row.get('of') != digest(policy):
+            row.clear()
+            row['of'] = digest(policy)
         if key in row or (ground and not _sees_ground(id_)):
             continue
         limits = {} if step_limit is None else {'step_limit': step_limit // _shorter(id_)}
-        result = evaluation.evaluate(
-            id_, policies.reference(id_), episodes, seed, threads, {**options, **limits}
-        )
+        result = evaluation.evaluate(id_, policy, episodes, seed, threads, {**options, **limits})
         row[key] = {
             name: result[name]
             for name in ('return', 'return_interval', 'completion_rate', 'distance', 'diverged')

@@ -1,6 +1,7 @@
 """Tests of trl_suite.tasks.variation: worlds that vary, pushes, sensors."""
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import json
@@ -16,9 +17,10 @@ from dm_control import mjcf
 from helpers import EVERY_PROPERTY as EVERY
 from helpers import FolderTest, assert_refused, assert_uniform
 
-from trl_suite import suite
+from trl_suite import evaluation, policies, suite
 from trl_suite.engine import PhysicsWorld, variation
 from trl_suite.tasks.variation import SensorConfig, WorldConfig, worlds
+from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -604,5 +606,26 @@ class ProgramsTest(FolderTest):
             self.assertEqual(robustness.run(ids, 2, [0], 1, 40, path), found)  # nothing is left
         with self.assertRaisesRegex(ValueError, 'other settings'):
             robustness.run(ids, 3, [0], 1, 40, path)
+        # A policy that was replaced is measured again.
+        other = dataclasses.replace(policies.reference(ids[0]), clip=3.0)
+        with (
+            mock.patch.object(robustness.policies, 'reference', lambda id_: other),
+            mock.patch.object(
+                robustness.evaluation, 'evaluate', wraps=evaluation.evaluate
+            ) as again,
+        ):
+            robustness.run(ids[:1], 2, [0], 1, 40, path)
+        self.assertLen(again.mock_calls, 2)
         share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
         self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
+
+    def test_the_measurements_are_of_the_shipped_policies(self):
+        if not policies.available('randomized'):
+            self.skipTest('the trained policies are not installed')
+        found = json.loads((ROOT / 'docs/data/robustness.json').read_text())
+        for rows in found['seeds'].values():
+            for id_, row in rows.items():
+                expected = digest(policies.reference(id_))
+                self.assertEqual(
+                    row['of'], expected, f'measure {id_} again: benchmarks/robustness.py'
+                )

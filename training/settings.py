@@ -619,7 +619,7 @@ RANDOMIZED: dict[str, dict[str, Any]] = {
     'Torque_Dog2D_LLC_Imitate_Flat-v0': {'enough': 0.76},
     'MTU_Raptor2D_LLC_Imitate_Flat-v0': {**FEWER, 'enough': 0.37},
     'PD_Biped2D_Gaps_Terrain-v0': {**FEWER, 'preset': 'robot', 'samples': 1.5e5},
-    'PD_Raptor2D_Slopes_Terrain-v0': {**FEWER, 'samples': 1e5},
+    'PD_Raptor2D_Slopes_Terrain-v0': {**FEWER, 'samples': 5e5},
     'PD_Biped3D_Imitate-v0': FEWER,
     # Plans and rewards of the last stage of its training; pushes are those of the preset.
     'PD_Biped3D_LLC_General_Step-v0': {**FEWER, 'stages': STAGES[-1:]},

@@ -31,6 +31,7 @@ from train_all import SEED
 
 from trl_suite import evaluation, policies
 from trl_suite.util import errors
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
@@ -60,13 +61,16 @@ def train(id_: str, seed: int, output: pathlib.Path) -> None:
 
 
 def measure(id_: str) -> dict[str, Any]:
-    """Evaluates where results are missing, and writes them; returns all results of an environment."""
+    """Evaluates where results of the present policies are missing; returns all of an environment."""
     entry = runs.read(place(id_))
     for name, variant in (('evaluations', 'randomized'), ('before', '')):
-        found = entry.setdefault(name, {})
+        policy, found = policies.reference(id_, variant), entry.setdefault(name, {})
+        of = entry.setdefault('of', {})
+        if of.get(name) != digest(policy):
+            found.clear()
+            of[name] = digest(policy)
         for condition, options in CONDITIONS.items():
             if condition not in found:
-                policy = policies.reference(id_, variant)
                 result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
                 found[condition] = {key: result[key] for key in RESULTS}
                 runs.write(place(id_), entry)

@@ -35,6 +35,7 @@ from trl_suite import benchmark, characters, evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.runs import Course
 from trl_suite.util import files
+from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
 
@@ -381,6 +382,9 @@ class RandomizedTest(parameterized.TestCase):
         self.addCleanup(environments.close)
         policy.check(environments)
         self.assertEqual(policy.info['samples'], entry['shipped_at'])
+        # Else measure again: `train_randomized.py`.
+        for name, variant in (('evaluations', 'randomized'), ('before', '')):
+            self.assertEqual(entry['of'][name], digest(policies.reference(id_, variant)), name)
 
 
 class GeneralistTest(FolderTest):
