@@ -7,7 +7,6 @@ Needs `pip install 'trl_suite[sb3]'`.
 """
 
 import copy
-import math
 
 import numpy as np
 import torch
@@ -29,7 +28,7 @@ class FineTuning:
         self.model = PPO(
             'MlpPolicy', self.scales, n_steps=STEPS, batch_size=512, n_epochs=5, gamma=0.95,
             target_kl=0.05, seed=seed, device='cpu',
-            policy_kwargs={'net_arch': [256, 256], 'log_std_init': math.log(0.2)},
+            policy_kwargs={'net_arch': [256, 256], 'log_std_init': np.log(0.2)},
         )  # fmt: skip
 
     def train(self, stage):
