@@ -505,7 +505,7 @@ def main():
         figures['solvers'][name] = solvers(GROUPS[name], starts, episodes // 2)
     report(figures)
     if arguments.json:
-        files.write_json(rounded(figures), arguments.json)
+        files.write_json(rounded(figures), arguments.json, indent=None)
     if arguments.plot:
         plot(figures, arguments.plot)
 

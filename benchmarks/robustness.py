@@ -120,7 +120,7 @@ def run(
             name: result[name]
             for name in ('return', 'return_interval', 'completion_rate', 'distance', 'diverged')
         }
-        files.write_json(found, path)
+        files.write_json(found, path, indent=None)
     return found
 
 

@@ -183,7 +183,7 @@ def main():
             run['environments'] + 1,
         )
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
-        files.write_json(figures, arguments.file)
+        files.write_json(figures, arguments.file, indent=None)
         bar.set_postfix_str(f'{steps / 1e6:.2f} M control steps, {run["memory"][-1][2]} MB')
         bar.update(min(round(run['seconds']), bar.total) - bar.n)
         if time.time() >= begin + arguments.seconds:

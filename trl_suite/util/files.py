@@ -244,7 +244,8 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
             return
 
 
-def write_json(content: Any, path: pathlib.Path) -> None:
-    """Writes an indented .json file."""
+def write_json(content: Any, path: pathlib.Path, indent: int | None = 1) -> None:
+    """Writes a .json file, in one line if `indent` is None."""
     with replacing(path) as part:
-        part.write_text(f'{json.dumps(content, indent=1, allow_nan=False)}\n', encoding='utf-8')
+        text = json.dumps(content, indent=indent, allow_nan=False)
+        part.write_text(f'{text}\n', encoding='utf-8')
