@@ -83,11 +83,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             shared[name] = given.pop(name)
     common = variation.CommonOptions.parse(spec.id, shared)
     realism.check(common.actuators, spec.actuation)
-    type_, config_type, others = (
-        task_type(spec),
-        config_of(spec),
-        (*names, 'step_limit', 'time_limit', 'random'),
-    )
+    type_, config_type = task_type(spec), config_of(spec)
+    others = (*names, 'step_limit', 'time_limit', 'random')
     if config_type is None:
         known, config = task_options(spec), None
         if not known.keys() >= given.keys():
@@ -134,9 +131,8 @@ def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators, config: 
     """Makes the parts of the task."""
     character = character_of(spec)
     ground = terrains.load(spec.part('terrain')).with_faces(getattr(config, 'face_length', None))
-    ground.parameters(
-        getattr(config, 'terrain_level', 0.0)
-    )  # refuses a level that it does not have
+    # A level that it does not have is refused here, not by the first reset.
+    ground.parameters(getattr(config, 'terrain_level', 0.0))
     if ground.spatial != character.spatial:
         presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
         raise ValueError(

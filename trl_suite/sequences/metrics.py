@@ -97,7 +97,8 @@ def learning_transfer(curve: ArrayLike, reference: ArrayLike) -> float:
       reference: those of training from scratch, (k,).
 
     Raises:
-      ValueError: a score is no number, the shapes differ, no point is in both, or the reference has the maximum throughout.
+      ValueError: a score is no number, the shapes differ, no point is in both, or the reference has
+        the maximum throughout.
     """
     both = _numbers('curve', curve), _numbers('reference', reference)
     if both[0].shape != both[1].shape or both[0].ndim != 1:
