@@ -537,11 +537,13 @@ def _train(
             if not trainer.begun:
                 trainer.imitate(settings.start, folder)
                 trainer.begun = True
-            batch = trainer.collect()
-            middle = time.perf_counter()
-            divergence = trainer.learn(batch)
-            if trainer.average:
-                trainer.average.update_parameters(trainer.policy)
+            # A policy that only imitates is not updated: its value network has learnt nothing.
+            batch = trainer.collect() if trainer.samples < total else None
+            middle, divergence = time.perf_counter(), 0.0
+            if batch is not None:
+                divergence = trainer.learn(batch)
+                if trainer.average:
+                    trainer.average.update_parameters(trainer.policy)
             if trainer.stage != trainer.current:
                 policies.save(trainer.exported(), folder / f'stage_{trainer.current}.npz')
             end = time.perf_counter()

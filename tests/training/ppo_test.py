@@ -389,6 +389,13 @@ class ImitationTest(FolderTest):
         self.assertEqual(trainer.samples, 160)
         self.assertLess(np.abs(trainer.exported()(seen) - labels).mean(), before / 2)
 
+    def test_a_policy_that_only_imitates_is_not_updated(self):
+        own = tiny(start='scripted', cloned=160, samples=160, value_first=0.0)
+        with mock.patch.object(ppo.Trainer, 'learn') as learn:
+            (point,) = ppo.train(SOCCER, 0, own, self.folder, threads=1, progress=False)
+        learn.assert_not_called()
+        self.assertEqual(point['samples'], 160)
+
     def test_after_the_first_round_the_policy_walks(self):
         seen = []
         for clonings in (1, 2):
