@@ -5,7 +5,8 @@
 
 Every cell has the same seeds, so that terrain and start of an episode are the same with and without
 the disturbance. The JSON file is written after every cell, and an unfinished run is resumed; cells of
-a policy that is no longer shipped are measured again. The table of the page has the return divided by that without disturbance.
+a policy that is no longer shipped are measured again. The table of the page has the return divided by
+that without disturbance.
 """
 
 from __future__ import annotations
