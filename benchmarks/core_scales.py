@@ -12,6 +12,7 @@ import argparse
 
 from trl_suite import evaluation, policies, runs
 from trl_suite.benchmark import core
+from trl_suite.environments import named_policies
 from trl_suite.util import files, machine
 from trl_suite.util.program import begin_script
 
@@ -26,7 +27,7 @@ def main() -> None:
     for id in arguments.ids:
         course, row = core.BENCHMARK.get(id), {'episodes': arguments.episodes}
         for name in ('zero', 'random', 'shipped'):
-            baseline = evaluation.BASELINES.get(name)
+            baseline = named_policies.BASELINES.get(name)
             result = evaluation.evaluate(
                 course.spec(id), baseline or policies.reference(id), arguments.episodes,
                 runs.test_seeds(arguments.episodes, SEED), factory=baseline is not None,

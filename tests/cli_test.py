@@ -25,6 +25,7 @@ import trl_suite
 from trl_suite import evaluation, policies, rendering, suite
 from trl_suite.cli import list as listing
 from trl_suite.cli import rollout
+from trl_suite.environments import named_policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait.task import GaitTask
 from trl_suite.tasks.navigation import scripted
@@ -439,7 +440,7 @@ class EvaluateTest(CommandTest):
     @parameterized.parameters('clip', 'zero', 'random')
     def test_baselines_are_those_of_evaluation(self, name):
         out = self.output('evaluate', GAPS, '--policy', name, '--episodes', '2')
-        expected = evaluation.evaluate(GAPS, evaluation.BASELINES[name], 2, factory=True)
+        expected = evaluation.evaluate(GAPS, named_policies.BASELINES[name], 2, factory=True)
         self.assertIn(f'  policy       {name}\n', out)
         self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
 

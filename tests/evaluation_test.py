@@ -13,6 +13,7 @@ from helpers import assert_refused
 from programs import GAPS, policy_for
 
 from trl_suite import evaluation, suite
+from trl_suite.environments import named_policies
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
 
@@ -41,7 +42,7 @@ def alone(id_, seeds, act, **options):
 
 class EvaluateTest(parameterized.TestCase):
     @parameterized.parameters(
-        (GAPS, make), (RAPTOR, make), (RAPTOR, evaluation.clip), (GAIT, evaluation.zero),
+        (GAPS, make), (RAPTOR, make), (RAPTOR, named_policies.clip), (GAIT, named_policies.zero),
     )  # fmt: skip
     def test_episodes_are_those_of_single_environments(self, id_, policy):
         """Also of the clip's actions, and where steps differ in duration."""
@@ -49,7 +50,7 @@ class EvaluateTest(parameterized.TestCase):
         policy = policy if factory else policy(id_)
 
         def act(environment, time_step):
-            if policy is evaluation.clip:
+            if policy is named_policies.clip:
                 return np.clip(environment.task.clip_action(0), -1, 1)
             return np.zeros(28) if factory else policy(time_step.observation)
 
@@ -63,7 +64,7 @@ class EvaluateTest(parameterized.TestCase):
 
     def test_seeds_may_be_given(self):
         seeds = [2**31 + 1, 7, 2**32 - 1]
-        found = evaluation.evaluate(GAPS, evaluation.zero, 3, seeds, factory=True)
+        found = evaluation.evaluate(GAPS, named_policies.zero, 3, seeds, factory=True)
         self.assertEqual((found['seeds'], found['seed']), (seeds, None))
         expected = alone(GAPS, seeds, lambda *_: np.zeros(11))
         self.assertEqual(found['returns'], expected[0])
@@ -97,7 +98,7 @@ class EvaluateTest(parameterized.TestCase):
         self.enterContext(mock.patch.object(evaluation, 'PART', 3))
         pickling = Pickling()
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
-            for policy, factory in ((make(GAPS), False), (evaluation.random, True)):
+            for policy, factory in ((make(GAPS), False), (named_policies.random, True)):
                 expected = evaluation.evaluate(GAPS, policy, 4, 2, factory=factory)
                 for executor in (pickling, pool):
                     options = {'factory': factory, 'executor': executor}
@@ -114,7 +115,7 @@ class EvaluateTest(parameterized.TestCase):
             self.assertEqual(evaluation.evaluate_all(cases, 3, 2, executor=pool), expected)
 
     def test_zero_actions_fall_early(self):
-        found = evaluation.evaluate(FLAT, evaluation.zero, 10, factory=True)
+        found = evaluation.evaluate(FLAT, named_policies.zero, 10, factory=True)
         self.assertEqual((found['falls'], found['completion_rate'], found['diverged']), (1, 0, 0))
         self.assertEqual(found['fell'], [True] * 10)
         self.assertLess(max(found['lengths']), 128)
@@ -141,16 +142,16 @@ class EvaluateTest(parameterized.TestCase):
             options = {'time_limit': 3.0}
             evaluation.evaluate(
                 'FSM_Hopper2D_Terrain_Gaps-v0',
-                evaluation.zero,
+                named_policies.zero,
                 1,
                 task_kwargs=options,
                 factory=True,
             )
 
     def test_a_fall_in_the_last_step_is_not_full_length(self):
-        found = evaluation.evaluate(FLAT, evaluation.zero, 3, factory=True)
+        found = evaluation.evaluate(FLAT, named_policies.zero, 3, factory=True)
         spec = dataclasses.replace(suite.find(FLAT), step_limit=found['lengths'][0])
-        again = evaluation.evaluate(spec, evaluation.zero, 1, factory=True)
+        again = evaluation.evaluate(spec, named_policies.zero, 1, factory=True)
         self.assertEqual((again['lengths'], again['fell']), (found['lengths'][:1], [True]))
         self.assertEqual(again['completion_rate'], 0)
 
@@ -208,4 +209,4 @@ class EvaluateTest(parameterized.TestCase):
         ):
             evaluation.evaluate(GAPS, None, 1)
         with self.assertRaisesRegex(ValueError, 'torque control cannot follow a clip'):
-            evaluation.evaluate('imitation/torque_dog', evaluation.clip, 1, factory=True)
+            evaluation.evaluate('imitation/torque_dog', named_policies.clip, 1, factory=True)

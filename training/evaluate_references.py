@@ -17,6 +17,7 @@ import runs
 import train_all
 
 from trl_suite import evaluation, policies
+from trl_suite.environments import named_policies
 from trl_suite.registry import catalogue
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
@@ -30,7 +31,7 @@ def flat_ground(spec: catalogue.EnvSpec) -> str:
 
 def of_default_gait(id_: str) -> dict[str, Any]:
     episodes = train_all.GAIT_EPISODES
-    return evaluation.evaluate(id_, evaluation.zero, episodes, train_all.SEED, 0, factory=True)
+    return evaluation.evaluate(id_, named_policies.zero, episodes, train_all.SEED, 0, factory=True)
 
 
 def of_flat_ground(id_: str) -> dict[str, Any]:

@@ -202,7 +202,7 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
 
 
 def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
-    """Makes an expert policy, like the functions in `evaluation.BASELINES`.
+    """Makes an expert policy, like the functions in `named_policies.BASELINES`.
 
     Raises:
       ValueError: the actions of the task are not footstep plans, or the task has a ball.

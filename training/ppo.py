@@ -35,13 +35,14 @@ from torch import nn
 from torch.optim import swa_utils
 
 from trl_suite import evaluation, policies, suite
+from trl_suite.environments import named_policies
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 TEACHERS: dict[str, Callable[..., Any]] = {
-    **evaluation.BASELINES,
+    **named_policies.BASELINES,
     'expert': expert,
     'joint_expert': joint_expert,
     'nominal': lambda environments: policies.reference('PD_Biped3D_LLC_General_Step-v0'),

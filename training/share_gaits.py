@@ -24,6 +24,7 @@ import train_all
 
 from trl_suite import evaluation, policies
 from trl_suite.cli.arguments import positive
+from trl_suite.environments import named_policies
 from trl_suite.util.program import begin_script
 
 
@@ -79,7 +80,7 @@ def main() -> None:
         if before is None and has_policy:
             before = evaluation.evaluate(id_, policies.reference(id_), *options)
         elif before is None:
-            before = evaluation.evaluate(id_, evaluation.zero, *options, factory=True)
+            before = evaluation.evaluate(id_, named_policies.zero, *options, factory=True)
         preference, policy = preferring(
             id_, policies.reference(arguments.policy), arguments.preferences, arguments.episodes,
             arguments.threads,

@@ -18,14 +18,13 @@ import numpy as np
 import tqdm
 
 import trl_suite.suite  # noqa: F401  tells what to install if dm_control is missing
+from trl_suite.environments.named_policies import BatchPolicy
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import machine
 from trl_suite.util.options import checked
 
-BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 MOST_EPISODES = 1_000_000
 CHUNK = 256  # episodes that run in parallel
 PART = 64  # the same, for an executor: small enough to keep many nodes busy
@@ -73,7 +72,7 @@ def evaluate(
       num_threads: threads that step the physics; 0 uses all cores, with an executor 1.
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
       factory: `policy` is a function `VectorEnvironment` -> policy, so that the policy can use more
-        than observations; the values of `BASELINES` are such functions.
+        than observations; the values of `named_policies.BASELINES` are such functions.
       progress: show a progress bar, in steps up to the step limit, with an executor in parts of
         `PART` episodes, if stderr is a terminal.
       executor: runs parts of `PART` episodes, for example on the nodes of a cluster; None runs them
@@ -266,39 +265,3 @@ def _bootstrap(values: np.ndarray) -> list[float]:
     random = np.random.default_rng(0)
     means = [random.choice(values, len(values)).mean() for _ in range(BOOTSTRAP)]
     return np.percentile(means, (2.5, 97.5)).tolist()
-
-
-def zero(environments: VectorEnvironment) -> BatchPolicy:
-    """Makes a policy that always takes action 0."""
-    action = np.zeros((environments.num_envs, len(environments.action_map)))
-    return lambda observation: action
-
-
-def random(environments: VectorEnvironment) -> BatchPolicy:
-    """Makes a policy that draws actions uniformly from [-1, 1]."""
-    size = len(environments.action_map)
-    # One stream per simulation, so that actions do not depend on how episodes are divided.
-    streams = [np.random.default_rng(seed) for seed in environments.seeds.tolist()]
-    return lambda observation: np.array([stream.uniform(-1, 1, size) for stream in streams])
-
-
-def clip(environments: VectorEnvironment) -> BatchPolicy:
-    """Makes a policy that follows the reference clip in open loop.
-
-    Raises:
-      ValueError: the task has no clip; or, when the policy is called, its actuation model cannot
-        follow one.
-    """
-    task: Any = environments.task
-    if not hasattr(task, 'clip_action'):
-        raise ValueError(f'{environments.spec.id} has no clip to follow')
-    env_ids = range(environments.num_envs)
-    return lambda observation: np.clip([task.clip_action(env_id) for env_id in env_ids], -1, 1)
-
-
-BASELINES: dict[str, Callable[[VectorEnvironment], BatchPolicy]] = {
-    'random': random,
-    'zero': zero,
-    'clip': clip,
-    'scripted': scripted,
-}

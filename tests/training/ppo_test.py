@@ -22,6 +22,7 @@ from helpers import FolderTest
 from settings import Settings, settings_for
 
 from trl_suite import evaluation, policies, terrain
+from trl_suite.environments import named_policies
 from trl_suite.registry import catalogue
 from trl_suite.util import machine
 
@@ -382,7 +383,7 @@ class ImitationTest(FolderTest):
 
     def test_a_run_may_start_by_imitating_a_baseline(self):
         trainer = make(SOCCER, start='scripted', cloned=160, view=(6.0, 3.0))
-        teacher = evaluation.BASELINES['scripted'](trainer.environments)
+        teacher = named_policies.BASELINES['scripted'](trainer.environments)
         seen, labels = trainer.observation.copy(), teacher(trainer.observation)
         before = np.abs(trainer.exported()(seen) - labels).mean()
         trainer.imitate('scripted')

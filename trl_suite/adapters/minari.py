@@ -26,6 +26,7 @@ import numpy as np
 import trl_suite
 from trl_suite import evaluation, policies
 from trl_suite.adapters.gym import flat
+from trl_suite.environments import named_policies
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.util import errors, machine
@@ -63,7 +64,7 @@ def mixed(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]
     return act
 
 
-POLICIES = {'reference': reference, 'mixed': mixed, 'random': evaluation.random}
+POLICIES = {'reference': reference, 'mixed': mixed, 'random': named_policies.random}
 
 
 def write(id: str, policy: str, episodes: int, seed: int = 0, num_threads: int = 0) -> str:

@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
     spec = engine.load().find(arguments.id)
     from trl_suite import evaluation
 
-    baseline = evaluation.BASELINES.get(arguments.policy)
+    baseline = acting.BASELINES.get(arguments.policy)
     options = dict(arguments.options or ())
     if arguments.step_limit is not None:
         options['step_limit'] = arguments.step_limit

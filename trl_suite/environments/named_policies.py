@@ -1,20 +1,69 @@
-"""Policies for a single environment, by name."""
+"""Policies by name: those that are shipped, and baselines that need no training."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
+from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import errors
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.rendering import Policy
 
+BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 POLICIES = ('reference', *policies.VARIANTS, 'clip', 'scripted', 'zero', 'random')  # or a file
+
+
+def zero(environments: Any) -> BatchPolicy:
+    """Makes a policy that always takes action 0, for a `VectorEnvironment` or an `Environment`."""
+    action = np.zeros((environments.task.world.n, len(environments.action_map)))
+    return lambda observation: action
+
+
+def random(environments: Any, seeds: Sequence[int] | None = None) -> BatchPolicy:
+    """Makes a policy that draws actions uniformly from [-1, 1].
+
+    Args:
+      environments: a `VectorEnvironment`, or an `Environment`.
+      seeds: one per simulation; those of the simulations if None.
+    """
+    size = len(environments.action_map)
+    # One stream per simulation, so that actions do not depend on how episodes are divided.
+    given = environments.seeds.tolist() if seeds is None else seeds
+    streams = [np.random.default_rng(seed) for seed in given]
+    return lambda observation: np.array([stream.uniform(-1, 1, size) for stream in streams])
+
+
+def clip(environments: Any) -> BatchPolicy:
+    """Makes a policy that follows the reference clip in open loop.
+
+    Args:
+      environments: a `VectorEnvironment`, or an `Environment`.
+
+    Raises:
+      ValueError: the task has no clip; or, when the policy is called, its actuation model cannot
+        follow one.
+    """
+    task = environments.task
+    if not hasattr(task, 'clip_action'):
+        raise ValueError(f'the task {type(task).__name__} has no clip to follow')
+    env_ids = range(task.world.n)
+    return lambda observation: np.clip([task.clip_action(env_id) for env_id in env_ids], -1, 1)
+
+
+# Functions of a `VectorEnvironment`, or of an `Environment`.
+BASELINES: dict[str, Callable[[Any], BatchPolicy]] = {
+    'random': random,
+    'zero': zero,
+    'clip': clip,
+    'scripted': scripted,
+}
 
 
 def check(name: str) -> str:
@@ -56,22 +105,9 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
       ValueError: the environment has no such policy, or the policy is incompatible with it.
       FileNotFoundError: there is no such file, or no reference is shipped.
     """
-    task: Any = environment.task
-    size = len(environment.action_map)
-    if name == 'zero':
-        return lambda time_step: np.zeros(size)
-    if name == 'random':
-        generator = np.random.default_rng(seed)
-        return lambda time_step: generator.uniform(-1, 1, size)
-    if name == 'scripted':
-        from trl_suite.tasks.navigation.scripted import scripted
-
-        walk = scripted(environment)
-        return lambda time_step: walk(np.concatenate([*time_step.observation.values()])[None])[0]
-    if name == 'clip':
-        if not hasattr(task, 'clip_action'):
-            raise ValueError(f'{id} has no clip to follow')
-        return lambda time_step: np.clip(task.clip_action(0), -1, 1)
+    if name in BASELINES:
+        act = random(environment, [seed]) if name == 'random' else BASELINES[name](environment)
+        return lambda time_step: act(np.hstack([*time_step.observation.values()])[None])[0]
     network = trained(check(name), id)
     network.check(environment)
     return lambda time_step: network(time_step.observation)
