@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
 SHOWN_EPISODES = 8  # largest number of episodes that are printed
-_ENDS = ('fell', 'stuck', 'diverged')  # causes of an end of episode, in a task's info
 
 
 def declare(commands: Any) -> None:
@@ -135,13 +134,12 @@ class _Record:
         if first:
             self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'unfinished'})
             return
-        episode, info = self._episodes[-1], environment.info
+        episode = self._episodes[-1]
         episode['steps'] += 1
         episode['return'] += time_step.reward
-        episode['distance'] = info.get('distance', 0.0)
+        episode['distance'] = environment.info.get('distance', 0.0)
         if time_step.last():
-            cut = 'truncated' if time_step.discount else 'failed'
-            episode['end'] = next((end for end in _ENDS if info.get(end)), cut)
+            episode['end'] = environment.ending
 
     def arrays(self) -> dict[str, Any]:
         """Returns the entries as arrays; actions[i] follows observations[i], or is 0 at ends of episodes."""

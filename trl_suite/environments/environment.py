@@ -27,6 +27,7 @@ from trl_suite.util.options import checked
 
 TIME_ERROR = 1e-6  # s; more than the error of a sum of physics steps, less than one of them
 HIGHLIGHT = (0.0, 0.5, 0.3)  # colour of a character with a reward of 1, as in dm_control.suite
+CAUSES = ('fell', 'stuck', 'diverged')  # entries of `info` that tell how a task failed
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
 _NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
@@ -391,6 +392,16 @@ class Environment(composer.Environment):
     def info(self) -> dict[str, Any]:
         """Further results of the last step, by name: see the task's `info_arrays`."""
         return self.task.info_of(0)
+
+    @property
+    def ending(self) -> str:
+        """Why the episode ended: 'fell', 'stuck', 'diverged', 'failed' or 'truncated'; '' before."""
+        if self.core.fresh or not self.core.ended[0]:
+            return ''
+        if not self.task.seen.failed[0]:
+            return 'truncated'
+        info = self.info
+        return next((cause for cause in CAUSES if info.get(cause)), 'failed')
 
     def observation(self) -> dict[str, np.ndarray]:
         """Returns the observation of the current state, e.g. after `set_state`."""

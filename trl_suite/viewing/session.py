@@ -29,7 +29,6 @@ PUSHES: Mapping[str, tuple[float, float, float]] = {  # directions, in world axe
     'right': (0, -1, 0),
     'up': (0, 0, 1),
 }
-_ENDS = ('fell', 'stuck', 'diverged')  # info keys that say why an episode ended
 
 
 class Moment(NamedTuple):
@@ -169,9 +168,8 @@ class Session:
         }
         if 'distance' in info:
             texts['distance'] = f'{info["distance"]:.2f} m'
-        if self.time_step.last():
-            default = 'truncated' if self.time_step.discount else 'failed'
-            texts['end'] = next((end for end in _ENDS if info.get(end)), default)
+        if self.environment.ending:
+            texts['end'] = self.environment.ending
         return texts
 
     def _rewards(self) -> np.ndarray:
