@@ -154,11 +154,7 @@ def gaits() -> str:
 
 
 def footsteps() -> str:
-    found = gallery.record('footsteps')['PD_Biped3D_LLC_General_Step-v0']
-    return table(
-        ('footstep controller', 'no fall', 'landing error, m'),
-        ((name, f'{found[name]["survived"]:.0%}', f'{found[name]["landing"]:.3f}') for name in CONDITIONS),
-    )  # fmt: skip
+    return compared(CONDITIONS, {'nominal': 'General', 'react': 'React'})
 
 
 def plans() -> str:
@@ -212,15 +208,17 @@ def pair(found: dict[str, Any], *keys: str) -> str:
 
 
 def stands() -> str:
-    of = [
-        gallery.record('footsteps')[f'PD_Biped3D_LLC_{part}_Step-v0']
-        for part in ('General', 'Stand')
-    ]
+    return compared(STANDS, {'nominal': 'General', 'stand': 'Stand'})
+
+
+def compared(conditions: Iterable[str], of: dict[str, str]) -> str:
+    """Returns a table of footstep controllers, by their names in the table, under conditions."""
+    found = [gallery.record('footsteps')[controllers(name)] for name in of.values()]
     rows = [
-        (name, *(f'{each[name]["survived"]:.0%}, {each[name]["landing"]:.3f} m' for each in of))
-        for name in STANDS
+        (name, *(f'{each[name]["survived"]:.0%}, {each[name]["landing"]:.3f} m' for each in found))
+        for name in conditions
     ]
-    return table(('plans', 'nominal', 'stand'), rows)
+    return table(('plans', *of), rows)
 
 
 def transfer() -> str:

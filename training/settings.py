@@ -317,6 +317,53 @@ STEADIER = ({
         footstep_scale=5.0, heading_scale=2.0,
     ),
 },)  # fmt: skip
+# With plans that go on from where a foot landed, a walker that is pushed may step wherever it keeps its
+# balance; what it lands beside the plan counts once, and is no failure.
+REACT = {'react': 1.0}
+FREELY, BY_ROOT_FREELY = {**FREE, **REACT}, {**BY_ROOT, **REACT}
+HARDER = {
+    'samples': 3e6, 'num_envs': 300, 'minibatch': 1024, 'gamma': 0.98, 'averaged': 2e5,
+    'start_count': 1e9, 'start_std': 0.12, 'value_first': 2e5, 'value_rate': 1e-3,
+    'value_goes_on': True, 'learning_rate': 2e-4, 'last_learning_rate': 2e-5, 'evaluate_every': 4e5,
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.03, **REACT}, 'pushes': pushes(140, 270)},
+            {'plans': {'sharp': 0.0, **REACT}, 'pushes': pushes(200, 300, 2.5, 4)},
+            {'plans': FREELY, 'pushes': pushes(100, 250)},
+            {'plans': {'sharp': 0.0}, 'pushes': pushes(140, 200)},
+            {'plans': BY_ROOT_FREELY, 'pushes': pushes(100, 250)},
+            {'plans': {**EVEN['plans'], **REACT}, 'pushes': pushes(140, 250)},
+            {'plans': {'sharp': 0.1}},
+            {'plans': {**BY_ROOT, 'root_turn': 0.6}, 'pushes': pushes(60, 160)},
+            {'plans': FREE, 'pushes': pushes(100, 200)},
+            {'plans': {'sharp': 0.03}, 'pushes': pushes(60, 160)},
+        ),
+        footstep_scale=5.0, heading_scale=2.0, max_landing_error=3.0,
+    ),
+}  # fmt: skip
+PUSHED = {
+    **ACCURATELY, **HARDER, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'landing_costs': {'landing_error': 10.0, 'heading_error': 3.0},
+    'evaluated_with': {
+        'plans': {'sharp': 0.0, **REACT},
+        'pushes': {'force': (250, 250), 'duration': (0.2, 0.2), 'interval': (3, 3)},
+    },
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.03, **REACT}, 'pushes': pushes(140, 270)},
+            {'plans': {'sharp': 0.0, **REACT}, 'pushes': pushes(200, 300, 2.5, 4)},
+            {'plans': FREELY, 'pushes': pushes(100, 250)},
+            {'plans': {'sharp': 0.0, **REACT}, 'pushes': pushes(230, 260, 2.5, 3.5)},
+            {'plans': BY_ROOT_FREELY, 'pushes': pushes(100, 250)},
+            {'plans': {**EVEN['plans'], **REACT}, 'pushes': pushes(150, 270)},
+            {'plans': {'sharp': 0.1, **REACT}},
+            {'plans': {**BY_ROOT_FREELY, 'root_turn': 0.6}, 'pushes': pushes(60, 200)},
+            {'plans': {'sharp': 0.05, **REACT}, 'pushes': pushes(60, 160), 'terrain': bumps(0.05)},
+            {'plans': {'sharp': 0.1, **REACT}, 'pushes': pushes(100, 200)},
+        ),
+        footstep_scale=5.0, heading_scale=2.0, max_landing_error=3.0,
+    ),
+}  # fmt: skip
 # Left and right differ: the nominal policy, which mirrors, is imitated first by one that does not.
 ONE_SIDED = {
     **STYLED, 'mirrored': False, 'samples': 4e6, 'start': 'nominal', 'start_std': None, 'initial_std': 0.12,
@@ -384,6 +431,24 @@ STANDING = {
             footstep_scale=10.0, heading_scale=2.0,
         ),
     },),
+}  # fmt: skip
+HARDER_STAND = {
+    **HARDER,
+    'stages': together(
+        (
+            {'plans': {'sharp': 0.03, 'stop': 0.1, **REACT}, 'pushes': pushes(140, 270)},
+            {'plans': {'sharp': 0.0, 'stop': 0.05, **REACT}, 'pushes': pushes(200, 300, 2.5, 4)},
+            {'plans': {**FREELY, 'stop': 0.1}, 'pushes': pushes(100, 250)},
+            {'plans': {'sharp': 0.0}, 'pushes': pushes(140, 200)},
+            {'plans': {**BY_ROOT_FREELY, 'stop': 0.1}, 'pushes': pushes(100, 250)},
+            {'plans': {'stop': 0.3, 'stay': (4, 80)}, 'pushes': pushes(60, 160)},
+            {'plans': {'stop': 0.3}, 'pushes': pushes(60, 160), 'terrain': ramp(0.08)},
+            {'plans': {**BY_ROOT, 'root_turn': 0.6, 'stop': 0.2}},
+            {'plans': {**FREE, 'stop': 0.1}, 'pushes': pushes(100, 200)},
+            {'plans': {'sharp': 0.1, 'stop': 0.05}},
+        ),
+        footstep_scale=5.0, heading_scale=2.0, max_landing_error=3.0,
+    ),
 }  # fmt: skip
 # Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
 # of the footstep controller, before it was averaged with the second.
@@ -604,6 +669,7 @@ OVERRIDES: tuple[Row, ...] = (
     *((f'PD_Biped3D_LLC_{name}_Step-v0', ONE_SIDED) for name in ('OneStraightLeg', 'SidewaysLean')),
     ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
     ('PD_Biped3D_LLC_Stand_Step-v0', STANDING),
+    ('PD_Biped3D_LLC_React_Step-v0', PUSHED),
     # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),

@@ -91,6 +91,11 @@ _STEPS = (
         origin='completion',
     ),
     _step(
+        'PD_Biped3D_LLC_React_Step-v0', 'llc_react_step',
+        'walks along planned footsteps, which go on from where the feet land', origin='addition',
+        plans={'react': 1.0},
+    ),
+    _step(
         'PD_Biped3D_LLC_Trail_Step-v0', 'llc_trail_step',
         'walks along planned footsteps towards goals on a trail', preset='trail3d2', origin='completion',
         goal=True, plans={'length': (0.4, 0.4)},
