@@ -172,7 +172,6 @@ def main() -> None:
         if arguments.policy
         else suite.reference_policy(arguments.id, arguments.variant)
     )
-    written = runs.read('footsteps.json')
     for name in arguments.filter:
         row, options = under(arguments.id, name)
         result = run(row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options)
@@ -185,8 +184,7 @@ def main() -> None:
             flush=True,
         )
         if not arguments.policy and not arguments.variant:
-            written.setdefault(arguments.id, {})[name] = result
-            runs.write('footsteps.json', written)
+            runs.add('footsteps.json', arguments.id, name, result)
 
 
 if __name__ == '__main__':

@@ -140,16 +140,14 @@ def main() -> None:
         raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
     options = {} if arguments.controller is None else {'controller': arguments.controller}
     under = '' if arguments.controller is None else f' with {arguments.controller}'
-    found = runs.read('plans.json')
     for id_ in ids:
         for name in arguments.policies:
             make = maker(id_, name)
             if make is None:
                 continue
             result = run(id_, make, arguments.episodes, arguments.seed, **options)
-            found.setdefault(id_, {})[name + under] = result
             print(id_, name + under, {k: round(v, 3) for k, v in result.items()}, flush=True)
-            runs.write('plans.json', found)
+            runs.add('plans.json', id_, name + under, result)
 
 
 if __name__ == '__main__':

@@ -201,6 +201,13 @@ def write(name: str, content: Any) -> None:
         part.write_text(json.dumps(content) + '\n')
 
 
+def add(name: str, id_: str, key: str, value: Any) -> None:
+    """Adds a result of an environment to a .json file, as it is now: other processes may write it, too."""
+    content = read(name)
+    content.setdefault(id_, {})[key] = value
+    write(name, content)
+
+
 def enter(name: str, key: str, value: Any) -> None:
     """Enters a result into a .json file."""
     write(name, dict(sorted({**read(name), key: value}.items())))

@@ -74,9 +74,7 @@ def main() -> None:
         under = how + (controller if isinstance(controller, str) else ', '.join(controller))
         print(under, {name: round(value, 3) for name, value in result.items()}, flush=True)
         if arguments.enter:
-            found = runs.read('plans.json')
-            found.setdefault(id_, {})[under] = result
-            runs.write('plans.json', found)
+            runs.add('plans.json', id_, under, result)
 
 
 if __name__ == '__main__':

@@ -451,11 +451,38 @@ class FootstepsTest(parameterized.TestCase):
         ('PD_Biped3D_LLC_InPlace_Step-v0', 'pushes of 150 N', {'length': (0.0, 0.1), 'sharp': 0.0}),
         ('PD_Biped3D_LLC_Stand_Step-v0', 'general', {'stop': 0.0}),
         ('PD_Biped3D_LLC_Stand_Step-v0', 'stops', {'stop': 0.1}),
+        ('PD_Biped3D_LLC_React_Step-v0', 'pushes of 250 N', {'react': 1.0, 'sharp': 0.0}),
     )
     def test_a_condition_keeps_the_plans_of_the_environment(self, id_, condition, plans):
         row, options = evaluate_footsteps.under(id_, condition)
         self.assertNotIn('plans', row.options)
         self.assertContainsSubset(plans.items(), options['plans'].items())
+
+    def test_strong_pushes_are_survived_with_plans_that_react(self):
+        survived = []
+        for id_ in (evaluate_footsteps.ID, 'PD_Biped3D_LLC_React_Step-v0'):
+            row, options = evaluate_footsteps.under(id_, 'pushes of 250 N')
+            found = evaluate_footsteps.run(row, policies.reference(id_), 16, 1, 10.0, **options)
+            survived.append(found['survived'])
+        self.assertGreater(survived[1], survived[0] + 0.3)
+
+
+class PlanEvaluationTest(FolderTest):
+    def test_results_that_another_process_writes_are_kept(self):
+        id_, result = 'PD_Biped3D_HLC_Soccer-v0', {'reward': 0.5}
+
+        def run(*arguments, **options):
+            runs.add('plans.json', id_, 'of another process', result)
+            return result
+
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(evaluate_plans, 'run', run),
+        ):
+            output(evaluate_plans.main, id_, '--policies', 'scripted')
+            self.assertEqual(
+                runs.read('plans.json'), {id_: {'of another process': result, 'scripted': result}}
+            )
 
 
 class PlannerTransferTest(absltest.TestCase):
