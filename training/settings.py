@@ -667,7 +667,7 @@ OVERRIDES: tuple[Row, ...] = (
     *((f'PD_Biped3D_LLC_{name}_Step-v0', {**STYLED, 'further': STEADIER})
       for name in ('HighKnees', 'StraightLegs', 'ForwardLean')),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', ONE_SIDED) for name in ('OneStraightLeg', 'SidewaysLean')),
-    *((f'PD_Biped3D_LLC_{name}_Step-v0', {'further': (*STEADIER, HARDER)}) for name in ('SidewaysLean',)),
+    *((f'PD_Biped3D_LLC_{name}_Step-v0', {'further': (*STEADIER, HARDER)}) for name in ('StraightLegs', 'SidewaysLean')),
     ('PD_Biped3D_LLC_InPlace_Step-v0', IN_PLACE),
     ('PD_Biped3D_LLC_Stand_Step-v0', STANDING),
     ('PD_Biped3D_LLC_React_Step-v0', PUSHED),
