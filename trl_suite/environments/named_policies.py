@@ -9,7 +9,6 @@ import numpy as np
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
-from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import errors
 
 if TYPE_CHECKING:
@@ -55,6 +54,14 @@ def clip(environments: Any) -> BatchPolicy:
         raise ValueError(f'the task {type(task).__name__} has no clip to follow')
     env_ids = range(task.world.n)
     return lambda observation: np.clip([task.clip_action(env_id) for env_id in env_ids], -1, 1)
+
+
+def scripted(environments: Any) -> BatchPolicy:
+    """Makes a hand-written policy for a high-level task; see `trl_suite.tasks.navigation.scripted`."""
+    # Imported here: the command line names policies also where dm_control is missing.
+    from trl_suite.tasks.navigation import scripted as planner
+
+    return planner.scripted(environments)
 
 
 # Functions of a `VectorEnvironment`, or of an `Environment`.
