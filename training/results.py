@@ -267,7 +267,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         ),
         (
             'Does training on terrain help?',
-            'Beside the policy that is trained on flat ground with the same observation, in the same episodes.',
+            'Compared in the same episodes with the policy for flat ground, which has the same observation.',
             ('environment', 'distance, own', 'flat policy', 'ratio', 'complete, own', 'flat policy'),
             transfer_rows(entries),
         ),

@@ -432,24 +432,6 @@ STANDING = {
         ),
     },),
 }  # fmt: skip
-HARDER_STAND = {
-    **HARDER,
-    'stages': together(
-        (
-            {'plans': {'sharp': 0.03, 'stop': 0.1, **REACT}, 'pushes': pushes(140, 270)},
-            {'plans': {'sharp': 0.0, 'stop': 0.05, **REACT}, 'pushes': pushes(200, 300, 2.5, 4)},
-            {'plans': {**FREELY, 'stop': 0.1}, 'pushes': pushes(100, 250)},
-            {'plans': {'sharp': 0.0}, 'pushes': pushes(140, 200)},
-            {'plans': {**BY_ROOT_FREELY, 'stop': 0.1}, 'pushes': pushes(100, 250)},
-            {'plans': {'stop': 0.3, 'stay': (4, 80)}, 'pushes': pushes(60, 160)},
-            {'plans': {'stop': 0.3}, 'pushes': pushes(60, 160), 'terrain': ramp(0.08)},
-            {'plans': {**BY_ROOT, 'root_turn': 0.6, 'stop': 0.2}},
-            {'plans': {**FREE, 'stop': 0.1}, 'pushes': pushes(100, 200)},
-            {'plans': {'sharp': 0.1, 'stop': 0.05}},
-        ),
-        footstep_scale=5.0, heading_scale=2.0, max_landing_error=3.0,
-    ),
-}  # fmt: skip
 # Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
 # of the footstep controller, before it was averaged with the second.
 ON_TRAILS = {

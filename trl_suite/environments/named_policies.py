@@ -34,7 +34,7 @@ def random(environments: Any, seeds: Sequence[int] | None = None) -> BatchPolicy
     """
     size = len(environments.action_map)
     # One stream per simulation, so that actions do not depend on how episodes are divided.
-    given = environments.seeds.tolist() if seeds is None else seeds
+    given = environments.core.seeds.tolist() if seeds is None else seeds
     streams = [np.random.default_rng(seed) for seed in given]
     return lambda observation: np.array([stream.uniform(-1, 1, size) for stream in streams])
 
