@@ -416,6 +416,20 @@ class ObservableTest(parameterized.TestCase):
         self.assertEqual(environment.info['distance'], x)
 
 
+class EndingTest(parameterized.TestCase):
+    @parameterized.parameters((3, 'truncated'), (256, 'fell'))
+    def test_the_cause_is_named_at_the_end_only(self, step_limit, cause):
+        """With action 0 the biped falls within 4 s."""
+        environment = newly_seeded('PD_Biped2D_LLC_Imitate_Flat-v0', 1, step_limit)
+        time_step = environment.reset()
+        while not time_step.last():
+            self.assertEqual(environment.ending, '')
+            time_step = environment.step(np.zeros(6))
+        self.assertEqual(environment.ending, cause)
+        environment.reset()
+        self.assertEqual(environment.ending, '')
+
+
 class HookTest(parameterized.TestCase):
     """Substeps run in C: hooks between them are refused, not forgotten."""
 
