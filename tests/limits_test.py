@@ -17,11 +17,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from absl.testing import parameterized
-from helpers import FolderTest
+from helpers import FolderTest, assert_refused
 from PIL import Image
 
 from trl_suite import (
     characters,
+    evaluation,
     motion,
     policies,
     rendering,
@@ -134,7 +135,7 @@ class LimitsTest(FolderTest):
         (lambda v: terrain.load('gaps').parameters(v), 'terrain_level'),
         (lambda v: terrain.from_heights(np.zeros((3, 3)), v), 'spacing'),
         (lambda v: terrain.from_heights([[v, v], [v, v]], 0.1), 'heights'),
-        (lambda v: terrain.from_function(np.sin, 'sine', start_span=v), 'StartSpan'),
+        (lambda v: terrain.from_function(np.sin, 'sine', start_span=v), 'start_span'),
         (lambda v: terrain.mesh.to_mesh(terrain.PlanarGround(terrain.load('gaps'), 0), v), 'low'),
         (lambda v: characters.Joint(v, 1, 1), 'kp'),
         (lambda v: dataclasses.replace(motion.load('dog_bound'), times=[0, v]), 'times'),
@@ -159,6 +160,26 @@ class LimitsTest(FolderTest):
             files.check_path(self.folder / name, ('.npz',))
         self.assertEqual(files.check_path(self.folder / 'a.npz', ('.npz',)).name, 'a.npz')
         self.assertLen([*self.folder.iterdir()], 1)
+
+    def test_values_of_another_kind(self):
+        function = {'a': (1, np.sum)}
+        assert_refused(
+            self,
+            *((lambda v=v: terrain.from_heights(np.zeros((3, 3)), 1, first=v), r'heights: first is')
+              for v in ('a', 0.5, [0, np.nan], (0, 'a'), (0, 0, 0))),
+            (lambda: terrain.from_heights(np.zeros(3), 1, start_span=-1), 'start_span is -1'),
+            (lambda: terrain.from_function(np.sin, 'sine', start_span='1'), 'start_span is .1.'),
+            *((lambda v=v: characters.Joint(1, 1, 1, original_range=v), 'original_range of a joint is')
+              for v in ((1, 2, 3), (3,), (2, 1), '01')),
+            *((lambda v=v: characters.Joint(1, 1, 1, v), 'target of a joint')
+              for v in ((1, 2), [[1, 2, 3]], 'a')),
+            (lambda: motion.read_deepmimic('run.json', joints=('a',)), 'given together'),
+            (lambda: evaluation._seeds(2, np.array([1, -2])), 'seed is -2'),
+            (lambda: rendering.film_strip([np.zeros((2, 2, 3), np.uint8)], columns='3'), 'columns is'),
+            (lambda: suite.make(IDS[0], {'rewards': {1: function['a']}}), 'a name in rewards is 1'),
+            (lambda: suite.make(IDS[0], {'observations': {'a': (True, np.sum)}}), "size of observation 'a'"),
+            (lambda: policies.reference(IDS[0], 3), 'known: generalist, randomized'),
+        )  # fmt: skip
 
     def assert_refused_unread(self, message, load, path):
         tracemalloc.start()

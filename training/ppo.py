@@ -34,9 +34,9 @@ from several import LANDING_ERRORS, Several
 from torch import nn
 from torch.optim import swa_utils
 
-from trl_suite import evaluation, policies, suite
+from trl_suite import evaluation, policies
 from trl_suite.environments import named_policies
-from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
@@ -85,7 +85,7 @@ class Trainer:
     ) -> None:  # fmt: skip
         """Makes a run that starts from `initial`, or else from `start` of the settings."""
         torch.manual_seed(seed)
-        self.spec = suite.find(environment) if isinstance(environment, str) else environment
+        self.spec = spec_of(environment)
         self.seed, self.settings, self.threads, s = seed, settings, threads, settings
         _check(s)
         self.samples = 0

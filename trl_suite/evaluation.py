@@ -130,7 +130,9 @@ def evaluate_all(
         progress=progress and executor is None,
     )
     start: Callable[..., Iterable[Any]] = map if executor is None else executor.map
-    running = [start(functools.partial(run, *case), parts) for case in cases]
+    running = [
+        start(functools.partial(run, environment, policy), parts) for environment, policy in cases
+    ]
     silent = None if progress and executor is not None else True
     results = []
     with tqdm.tqdm(total=len(running) * len(parts), disable=silent, unit='part') as bar:
@@ -151,6 +153,8 @@ def evaluate_all(
 def _seeds(episodes: int, seed: int | Sequence[int]) -> list[int]:
     """Returns the seed of each episode."""
     episodes = checked('episodes', episodes, int, at_least=1, at_most=MOST_EPISODES)
+    if isinstance(seed, np.ndarray):
+        seed = seed.tolist()
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
         if len(seed) != episodes:
             raise ValueError(f'{len(seed)} seeds for {episodes} episodes')

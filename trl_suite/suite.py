@@ -116,6 +116,7 @@ def build(
 
     Raises:
       ValueError: unknown names or options, or parts that are incompatible.
+      TypeError: a character, clip or task of another type.
     """
     spec = combine(character, actuation, terrain, task, clip)
     return build_environment(spec, task_kwargs, environment_kwargs)
@@ -149,6 +150,7 @@ def combine(
 
     Raises:
       ValueError: unknown names, or parts that are incompatible.
+      TypeError: a character, clip or task of another type.
     """
     figure = characters.spec_of(character)
     own: dict[str, Any] = {} if isinstance(character, str) else {'character': character}

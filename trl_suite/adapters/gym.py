@@ -289,7 +289,7 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
         return {'step_limit': None, **options}
     limit = checked('max_episode_steps', max_episode_steps, int | None, at_least=1)
     if limit is not None:
-        own = options.get('step_limit')
+        own = checked('step_limit', options.get('step_limit'), int | None, at_least=1)
         options['step_limit'] = limit if own is None else min(own, limit)
     return options
 

@@ -12,7 +12,7 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from trl_suite.util import errors, resources
-from trl_suite.util.options import checked
+from trl_suite.util.options import Range, checked
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
 DIGITS = 6  # decimals of the values in a digest
@@ -42,7 +42,8 @@ class Joint:
       armature: inertia in kg m^2 that is added so that stiff servos of light links are stable.
 
     Raises:
-      ValueError: a gain, a weight or an armature is negative, or a value is not finite.
+      ValueError: a gain, a weight or an armature is negative, or a value is not finite or has the
+        wrong shape.
     """
 
     kp: float
@@ -55,8 +56,11 @@ class Joint:
     def __post_init__(self) -> None:
         for name in ('kp', 'kd', 'weight', 'armature'):
             checked(f'{name} of a joint', getattr(self, name), float, at_least=0)
-        for name, value in (('target', self.target), ('original_range', self.original_range or 0)):
-            errors.floats(f'{name} of a joint', value)
+        checked('original_range of a joint', self.original_range, Range | None)
+        if np.shape(errors.floats('target of a joint', self.target)) not in ((), (3,)):
+            raise ValueError(
+                f'target of a joint is {self.target!r}; expected a number, or a rotation vector'
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +158,14 @@ class Character(composer.Entity):
             self._mjcf_root.model = name
         # Names that the file lacks raise here.
         _ = *self.joints, *self.bodies, *self.end_effectors
-        for (joint, given), (low, high) in zip(spec.joints.items(), self.joint_ranges, strict=True):
+        for (joint, given), (low, high), ball in zip(
+            spec.joints.items(), self.joint_ranges, self.spherical, strict=True
+        ):
+            if np.ndim(given.target) and not ball:
+                raise ValueError(
+                    f'character {spec.name!r}: target of {joint!r} is {given.target}; expected a number, as '
+                    'it is no ball joint'
+                )
             if np.ndim(given.target) == 0 and not low - 1e-6 <= given.target <= high + 1e-6:
                 raise ValueError(
                     f'character {spec.name!r}: target of {joint!r} is {given.target:g}; expected {low:g} to '

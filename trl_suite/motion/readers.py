@@ -117,6 +117,8 @@ def read_deepmimic(
       FileNotFoundError: if there is no such file.
     """
     path = pathlib.Path(path)
+    if (joints is None) != (sizes is None):
+        raise ValueError('joints and sizes are given together, or neither')
     motion = _parse(path)
     loop = motion.get('Loop', 'none')
     if loop not in ('wrap', 'none'):
@@ -131,7 +133,9 @@ def read_deepmimic(
         if motion.get('CycleSyncRootPos', True) is not True:
             found = motion['CycleSyncRootPos']
             raise ValueError(f'{path}: CycleSyncRootPos: {found!r} is not supported')
-        if not motion.get('CycleSyncRootHeight', False):
+        if not checked(
+            f'{path}: CycleSyncRootHeight', motion.get('CycleSyncRootHeight', False), bool
+        ):
             times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
             gain = frames[-1, 2] - frames[0, 2]
             frames[:, 2] -= gain * times / times[-1]

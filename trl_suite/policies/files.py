@@ -207,7 +207,8 @@ def _source(id: str, variant: str = '') -> tuple[str, float]:
 
 def _folder(variant: str) -> pathlib.Path:
     """Returns the folder of the policies of a variant, or of '', the policies themselves."""
-    errors.check_known('variant of policies', ('', *VARIANTS), variant)
+    if variant:
+        errors.check_known('variant of policies', VARIANTS, variant)
     return resources.directory('trained') / variant
 
 

@@ -42,8 +42,7 @@ def film_strip(
     Raises:
       ValueError: no pictures, pictures of different sizes, columns below 1, or another suffix.
     """
-    if columns < 1:
-        raise ValueError(f'columns is {columns}; expected at least 1')
+    columns = checked('columns', columns, int, at_least=1)
     images = [check_image(image) for image in frames]
     if not images:
         raise ValueError('a film strip needs at least one frame')

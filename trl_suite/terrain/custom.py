@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import inspect
 import math
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from trl_suite.terrain.generators import START_SPAN, Parameters, register3d, reg
 from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util import errors
+from trl_suite.util.digest import digest
 from trl_suite.util.files import check_size, existing
 from trl_suite.util.libraries import library
 from trl_suite.util.options import checked
@@ -86,6 +86,7 @@ def from_function(
     """
     if not callable(function):
         raise TypeError(f'a function of x, or of x and y, is needed, not {function!r}')
+    _check_span(start_span)
     if name is None:
         name = str(getattr(function, '__name__', 'object'))
         if name == '<lambda>' or not hasattr(function, '__name__'):
@@ -95,6 +96,11 @@ def from_function(
     _register(name, function, arguments, replace)
     recipe = functools.partial(from_function, start_span=start_span, replace=True), (function, name)
     return CustomTerrain(name, name, ({'StartSpan': start_span},), recipe)
+
+
+def _check_span(start_span: float) -> None:
+    limits = START_SPAN['StartSpan']
+    checked('start_span', start_span, float, 'm', at_least=limits.low, at_most=limits.high)
 
 
 def _arguments(function: HeightFunction) -> int:
@@ -174,7 +180,12 @@ def from_heights(
             f'each axis and no more than {LARGEST:g} in all'
         )
     checked(f'{name}: spacing', spacing, float, 'm', above=0)
-    corner = -(np.array(heights.shape) // 2) if first is None else np.atleast_1d(first)
+    _check_span(start_span)
+    if first is None:
+        corner = -(np.array(heights.shape) // 2)
+    else:
+        given = (first,) if errors.is_number(first) else first
+        corner = np.array(checked(f'{name}: first', given, Sequence[int]), int)
     if corner.shape != (heights.ndim,):
         raise ValueError(
             f'{name}: first is {first}; expected a number for each of {heights.ndim} axes'
@@ -189,10 +200,8 @@ def from_heights(
         x = spacing * (corner[0] + np.arange(len(heights)))
         heights, corner = _Raster(heights, spacing, corner)(x, line), corner[:1]
     raster = _Raster(heights, spacing, corner)
-    # Named by a hash of its content, so that the same ground has the same type in every process.
-    digest = hashlib.sha256(heights.tobytes())
-    digest.update(repr((heights.shape, spacing, corner.tolist())).encode())
-    type_name = f'{name}#{digest.hexdigest()[:12]}'
+    # Named by its content, so that the same ground has the same type in every process.
+    type_name = f'{name}#{digest((heights, spacing, corner))}'
     _register(type_name, raster if heights.ndim == 2 else raster.along, heights.ndim)
     again = functools.partial(from_heights, first=tuple(corner.tolist()), start_span=start_span)
     return CustomTerrain(

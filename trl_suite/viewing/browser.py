@@ -30,6 +30,7 @@ from trl_suite import policies, suite
 from trl_suite.environments import named_policies
 from trl_suite.environments.arguments import check_seed
 from trl_suite.environments.environment import Environment
+from trl_suite.registry.catalogue import spec_of
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.util import notices, program
@@ -114,7 +115,7 @@ class Browser:
         self._files: dict[str, policies.Policy] = {}  # what .npz files held, by name
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
-        spec = suite.find(spec) if isinstance(spec, str) else spec
+        spec = spec_of(spec)
         if policy.endswith('.npz'):
             self._files[policy] = policies.load(policy)
         elif policy != 'best':
@@ -281,7 +282,7 @@ class Browser:
         self._panel.report({'loading': text}, self.playing)
 
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
-        spec = suite.find(spec) if isinstance(spec, str) else spec
+        spec = spec_of(spec)
         environment = suite.build_environment(spec, self._task_kwargs, {})
         choices = named_policies.available(environment, spec.id, self.seed)
         if policy == 'best':

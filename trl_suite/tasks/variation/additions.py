@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from trl_suite.bodies.blocks import Block, by_name
 from trl_suite.engine import World
 from trl_suite.tasks.component import Component
 from trl_suite.tasks.rewards import Outcome, outcome
-from trl_suite.util import errors
+from trl_suite.util.options import checked
 
 if TYPE_CHECKING:
     from trl_suite.tasks.task import Task
@@ -69,6 +68,7 @@ class Additions(Component):
             if not isinstance(entries, Mapping):
                 raise ValueError(f'{kind} is {entries!r}; expected a dict of name -> part')
             for name, entry in entries.items():
+                checked(f'a name in {kind}', name, str)
                 if first and not (isinstance(entry, tuple) and len(entry) == 2):
                     raise ValueError(f'{kind}[{name!r}] is {entry!r}; expected ({first}, function)')
         self._rewards, self._extras, self._failures = (
@@ -77,15 +77,13 @@ class Additions(Component):
             dict(failures),
         )
         for name, (weight, function) in self._rewards.items():
-            good = errors.is_number(weight) and math.isfinite(weight)
-            _check('reward', name, function, good, f'weight {weight!r}; expected a finite number')
+            checked(f'weight of reward {name!r}', weight, float)
+            _check('reward', name, function)
         for name, (size, function) in self._extras.items():
-            whole = isinstance(size, (int, np.integer)) and size > 0
-            _check(
-                'observation', name, function, whole, f'size {size!r}; expected a positive integer'
-            )
+            checked(f'size of observation {name!r}', size, int, at_least=1)
+            _check('observation', name, function)
         for name, function in self._failures.items():
-            _check('failure', name, function, True, '')
+            _check('failure', name, function)
         self.blocks = tuple(Block(name, int(size)) for name, (size, _) in self._extras.items())
 
     def added_to(self, task: Task) -> None:
@@ -170,8 +168,6 @@ class Additions(Component):
         return value
 
 
-def _check(kind: str, name: str, function: Any, good: Any, number: str) -> None:
+def _check(kind: str, name: str, function: Any) -> None:
     if not callable(function):
         raise ValueError(f'{kind} {name!r} is {function!r}; expected a function of the task')
-    if not good:
-        raise ValueError(f'{kind} {name!r} has {number}')
