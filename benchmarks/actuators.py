@@ -308,9 +308,7 @@ def page() -> None:
     if 'effects' in found:
         parts['effects'] = effect_table(found['effects'])
     for name, part in parts.items():
-        files.replace_between(
-            PAGE, f'<!-- actuators: {name} -->', '<!-- end -->', f'\n{part.strip()}\n'
-        )
+        files.replace_between(PAGE, name, 'benchmarks/actuators.py', f'\n{part.strip()}\n')
 
 
 if __name__ == '__main__':

@@ -38,7 +38,6 @@ WALKS = {
 }  # fmt: skip
 OTHERS = ('Torque', 'MTU', 'Vel')  # actuation models, compared without changes
 SHORT = 0.05  # s
-_MARK, _END = '<!-- contacts, written by benchmarks/contacts.py -->', '<!-- /contacts -->'
 
 Change = Callable[[mujoco.MjModel, np.ndarray], None]  # of a model, given the geoms of the feet
 
@@ -307,7 +306,7 @@ def main() -> None:
     text = table(run(arguments.episodes, arguments.seed, arguments.json))
     print(text)
     if arguments.page is not None:
-        files.replace_between(arguments.page, _MARK, _END, text)
+        files.replace_between(arguments.page, 'contacts', 'benchmarks/contacts.py', text)
 
 
 if __name__ == '__main__':

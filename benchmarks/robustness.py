@@ -77,7 +77,6 @@ DISTURBANCES: list[tuple[str, str, bool, list[tuple[str, dict[str, Any]]]]] = [
     ('delay of the ground', 'steps', True, _sensors('delay', 2, 5, 10, ground=True)),
     ('terrain_dropout', '', True, _sensors('terrain_dropout', 0.05, 0.2, 0.5)),
 ]  # fmt: skip
-_MARK, _END = '<!-- robustness, written by benchmarks/robustness.py -->', '<!-- /robustness -->'
 
 
 def cells() -> list[tuple[str, bool, dict[str, Any]]]:
@@ -228,7 +227,7 @@ def main() -> None:
     text = table(found)
     print(text)
     if arguments.page is not None:
-        files.replace_between(arguments.page, _MARK, _END, text)
+        files.replace_between(arguments.page, 'robustness', 'benchmarks/robustness.py', text)
 
 
 if __name__ == '__main__':

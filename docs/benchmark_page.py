@@ -191,8 +191,7 @@ def page(found: dict[str, Any], others: list[dict[str, Any]], text: str) -> str:
         ('leaderboard', leaderboard(found, others)),
         ('levels', levels()),
     ):
-        begin, end = f'<!-- {name}, written by docs/benchmark_page.py -->', f'<!-- /{name} -->'
-        text = files.between(text, begin, end, f'\n{content}\n')
+        text = files.between(text, name, 'docs/benchmark_page.py', f'\n{content}\n')
     return text
 
 

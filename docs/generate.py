@@ -439,9 +439,8 @@ def filled(path: str, tables: dict[str, str]) -> str:
     """Returns a page with its tables written between comments with their names."""
     text = (DOCS / path).read_text(encoding='utf-8')
     for name, written in tables.items():
-        start, end = f'<!-- {name}, written by docs/generate.py -->', f'<!-- /{name} -->'
         with errors.naming(path):
-            text = files.between(text, start, end, written)
+            text = files.between(text, name, 'docs/generate.py', written)
     return text
 
 

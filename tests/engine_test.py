@@ -23,7 +23,6 @@ XML = """
     <material name="red" rgba="1 0 0 1"/></asset>
   <worldbody>
     <geom name="floor" type="box" size="5 5 .1" pos="0 0 -.1" material="red"/>
-    <body name="belt" mocap="true" pos="0 0 .1"><geom type="box" size=".2 .2 .02"/></body>
     <body name="trunk" pos="0 0 .6">
       <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
       <joint name="pitch" axis="0 1 0"/>
@@ -69,7 +68,7 @@ class StepTest(parameterized.TestCase):
             data.ctrl[:] = each
             for _ in range(SUBSTEPS):
                 mujoco.mj_step(raw_model, data)
-            found.append(np.concatenate([data.qpos, data.qvel, data.act]))
+            found.append(np.concatenate([data.qpos, data.qvel]))
         return np.array(found), data.time
 
     def stepped(self, world, ctrl):
@@ -78,7 +77,7 @@ class StepTest(parameterized.TestCase):
         for each in ctrl:
             world.ctrl[:] = each
             world.step(SUBSTEPS)
-            found.append(np.concatenate([world.qpos, world.qvel, world.act], 1))
+            found.append(np.concatenate([world.qpos, world.qvel], 1))
         return np.array(found)
 
     def test_one_simulation(self):
@@ -125,14 +124,11 @@ class StepTest(parameterized.TestCase):
     def test_written_arrays_reach_the_physics(self):
         world = BatchWorld(model(), 2, 1)
         world.qpos[1, :4], world.qvel[1, :4] = (1.0, 0.2, 0.3, -0.4), 0.5
-        world.mocap_pos[1, 0] = (3.0, 0.0, 1.0)
         world.forward(np.array([1]))
         one, data = world.models[1], mujoco.MjData(world.models[1])
         data.qpos[:4], data.qvel[:4] = (1.0, 0.2, 0.3, -0.4), 0.5
-        data.mocap_pos[0] = (3.0, 0.0, 1.0)
         mujoco.mj_forward(one, data)
         np.testing.assert_array_equal(world.xpos[1], data.xpos)
-        np.testing.assert_array_equal(world.xpos[1, world.body_ids(['belt'])], [[3.0, 0.0, 1.0]])
         self.assertEqual(world.xpos[0, 1, 0], 0.0)
 
     @parameterized.named_parameters(
@@ -167,7 +163,7 @@ class NamesTest(parameterized.TestCase):
         one = world.models[0]
         with self.assertRaisesRegex(ValueError, r"the model has no body named \['tail'\]"):
             world.body_ids(['leg', 'tail'])
-        self.assertEqual(world.body_ids(['leg', 'ball']).tolist(), [3, 4])
+        self.assertEqual(world.body_ids(['leg', 'ball']).tolist(), [2, 3])
         self.assertEqual(world.geom_ids(['floor']).tolist(), [0])
         self.assertEqual(world.site_ids(['foot']).tolist(), [1])
         self.assertEqual([a.tolist() for a in world.joint_addresses(['hip', 'x'])], [[3, 0]] * 2)

@@ -909,10 +909,10 @@ class TaskTest(parameterized.TestCase):
         assert_refused(self, *((lambda o=o: step(o), message) for o, message in (
             ({'rewards': {'a': (1, parts.joint_angles)}}, r"reward 'a' has shape \(1, 11\)"),
             ({'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is not finite"),
-            ({'observations': {'a': (-5, parts.speed)}}, "size of observation 'a' is -5; expected a whole number, at least 1"),
+            ({'observations': {'a': (-5, parts.speed)}}, "size of observation 'a' is -5; expected a whole number at least 1"),
             ({'observations': {'pose': (1, parts.speed)}}, "already has a block 'pose'"),
             ({'rewards': {'a': parts.speed}}, r'expected \(weight, function\)'),
-            ({'rewards': {'a': (parts.speed, 1.0)}}, "reward 'a' is 1.0; expected a function of the task"),
+            ({'rewards': {'a': (1.0, 1.0)}}, "reward 'a' is 1.0; expected a function of the task"),
             ({'rewards': {'a': (math.inf, parts.speed)}}, "weight of reward 'a' is inf; expected a number"),
             ({'rewards': {'pose': (1, parts.speed)}}, "already has a reward term 'pose'"),
             ({'failures': {'a': 1}}, 'expected a function'),

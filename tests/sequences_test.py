@@ -17,7 +17,7 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest, assert_refused
 from programs import CommandTest, run
 
-from trl_suite import benchmark, evaluation, sequences, suite
+from trl_suite import benchmark, evaluation, runs, sequences, suite
 from trl_suite.runs import results, running
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
@@ -68,13 +68,13 @@ class CatalogueTest(parameterized.TestCase):
 
 class SeedsTest(absltest.TestCase):
     def test_train_and_test_seeds_are_disjoint(self):
-        train, test = sequences.train_seeds(2000, (1, 2)), sequences.test_seeds(2000, (1, 2))
+        train, test = runs.train_seeds(2000, (1, 2)), runs.test_seeds(2000, (1, 2))
         self.assertLess(max(train), 2**31)
         self.assertBetween(min(test), 2**31, max(test))
         self.assertLess(max(test), 2**32)
         self.assertGreater(len(set(train)), 1990)
-        self.assertEqual(train[:5], sequences.train_seeds(5, (1, 2)))
-        self.assertNotEqual(train[:5], sequences.train_seeds(5, (1, 3)))
+        self.assertEqual(train[:5], runs.train_seeds(5, (1, 2)))
+        self.assertNotEqual(train[:5], runs.train_seeds(5, (1, 3)))
 
 
 class MetricsTest(parameterized.TestCase):
@@ -138,7 +138,7 @@ class MetricsTest(parameterized.TestCase):
 
 class StageTest(absltest.TestCase):
     def stage(self, budget=40, number=1, seed=0):
-        return sequences.Stage(SHORT, number, budget, seed, 1)
+        return runs.Stage(SHORT, number, budget, seed, 1)
 
     def test_steps_of_every_simulation_are_samples(self):
         stage = self.stage()
@@ -163,7 +163,7 @@ class StageTest(absltest.TestCase):
         environments.step(action)
         before = environments.task.world.time.copy()
         with self.assertRaisesRegex(
-            sequences.BudgetExceededError,
+            runs.BudgetExceededError,
             r'stage 1 \(PD_Dog2D_Steps.*4 more samples; expected at most 2, since 8 of 10',
         ):
             environments.step(action)
@@ -171,7 +171,7 @@ class StageTest(absltest.TestCase):
         self.assertEqual(stage.left, 2)
         environments.step(action, [0, 1])  # what is left may be used
         stage.finish()
-        with self.assertRaisesRegex(sequences.BudgetExceededError, 'has ended'):
+        with self.assertRaisesRegex(runs.BudgetExceededError, 'has ended'):
             environments.step(action, [0])
 
     def test_steps_that_are_refused_are_free(self):
@@ -202,14 +202,14 @@ class StageTest(absltest.TestCase):
         environments = self.stage().environments(3)
         self.assertEqual(environments.seeds.tolist(), list(drawn[0]))
         environments.reset(seed=5)
-        self.assertEqual(environments.seeds.tolist(), sequences.train_seeds(3, 5))
-        foreign = VectorEnvironment(SHORT.ids[1], 3, seed=sequences.test_seeds(3))
+        self.assertEqual(environments.seeds.tolist(), runs.train_seeds(3, 5))
+        foreign = VectorEnvironment(SHORT.ids[1], 3, seed=runs.test_seeds(3))
         foreign.reset()
         make, for_tests = self.stage().environments, 'is for tests; expected training seeds'
         assert_refused(
             self,
             (lambda: environments.seed([1, 2, 2**31]), for_tests),
-            (lambda: environments.seed(sequences.test_seeds(3)), for_tests),
+            (lambda: environments.seed(runs.test_seeds(3)), for_tests),
             (lambda: environments.reset(seed=2**31), for_tests),
             (lambda: environments.set_state(foreign.get_state()), for_tests),
             (lambda: environments.seed(None), 'seed is None'),
@@ -308,7 +308,7 @@ class RunTest(RunCase):
         learner, executor = Counter(), object()
         result = self.run_short(learner, seed=3, episodes=2, num_threads=5, executor=executor)
         self.assertEqual(learner.history, [[id_, 7, 3] for id_ in SHORT.ids])
-        tests = [mock.call(mock.ANY, 2, sequences.test_seeds(2, 3), 5, executor=executor)] * 4
+        tests = [mock.call(mock.ANY, 2, runs.test_seeds(2, 3), 5, executor=executor)] * 4
         self.assertEqual(self.tests.call_args_list, tests)
         np.testing.assert_allclose(result['initial'], [0, 0.01, 0.02])
         np.testing.assert_allclose(
@@ -441,7 +441,7 @@ class RunTest(RunCase):
             (Greedy, '3 more samples.* at most 2'),
             (Late, 'steps in train only'),
         ):
-            with self.assertRaisesRegex(sequences.BudgetExceededError, message):
+            with self.assertRaisesRegex(runs.BudgetExceededError, message):
                 self.run_short(kind())
             self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
             self.path.unlink()
@@ -745,9 +745,9 @@ class BaselinesTest(CommandTest):
         """Trained twice on one environment, it begins with the same weights."""
         learner = continual.Scratch(SHORT, 0)
         first = learner.policy().weights[1]
-        learner.train(sequences.Stage(SHORT, 0, 600, 0, 1))
+        learner.train(runs.Stage(SHORT, 0, 600, 0, 1))
         self.assertFalse(np.array_equal(learner.policy().weights[1], first))
-        learner.train(sequences.Stage(SHORT, 1, 10, 0, 1))  # too few samples for an update
+        learner.train(runs.Stage(SHORT, 1, 10, 0, 1))  # too few samples for an update
         np.testing.assert_array_equal(learner.policy().weights[1], first)
 
     def test_fisher_information_of_a_linear_policy(self):
@@ -772,7 +772,7 @@ class BaselinesTest(CommandTest):
     def test_distillation_gives_each_expert_its_terrain(self):
         """Two experts with constant actions, on terrains that the labels tell apart."""
         learner = continual.Plaid(SHORT, 0)
-        stage = sequences.Stage(SHORT, 1, 600, 0, 1)
+        stage = runs.Stage(SHORT, 1, 600, 0, 1)
         environments = continual.together(stage, SHORT.ids[:2])
         labels = []
         size = len(environments.action_map)

@@ -342,7 +342,7 @@ def main() -> None:
     if arguments.picture is not None:
         pages.curves(arguments.picture, compared.panels(found['results']), compared.axis)
     if arguments.page is not None:
-        pages.replace(arguments.page, name, 'compare', text)
+        files.replace_between(arguments.page, name, 'training/compare.py', text)
 
 
 if __name__ == '__main__':

@@ -22,6 +22,7 @@ import torch
 from several import Several
 
 from trl_suite import policies, sequences
+from trl_suite.runs import Stage
 
 NUM_ENVS = 64
 STRENGTH = 1.0  # of the penalty of `EWC`, in units of the divergence from the previous policy
@@ -44,7 +45,7 @@ class FineTuning:
         own = settings.settings_for(first, start='', stages=(), num_envs=NUM_ENVS)
         return ppo.Trainer(first, self.seed, own, 1)
 
-    def train(self, stage: sequences.Stage) -> None:
+    def train(self, stage: Stage) -> None:
         self.learn(stage.environments(NUM_ENVS, autoreset='disabled'), stage.budget)
 
     def learn(self, environments: Any, samples: int) -> dict[str, torch.Tensor]:
@@ -74,7 +75,7 @@ class FineTuning:
 class Scratch(FineTuning):
     """A new policy for every environment; the score on each after its stage is the reference."""
 
-    def train(self, stage: sequences.Stage) -> None:
+    def train(self, stage: Stage) -> None:
         self.trainer = self.new_trainer()
         super().train(stage)
 
@@ -82,7 +83,7 @@ class Scratch(FineTuning):
 class MultiTask(FineTuning):
     """One policy, trained on all environments from the start; the order has no effect."""
 
-    def train(self, stage: sequences.Stage) -> None:
+    def train(self, stage: Stage) -> None:
         self.learn(together(stage, stage.ids), stage.budget)
 
 
@@ -100,7 +101,7 @@ class EWC(FineTuning):
         self.fisher: dict[str, torch.Tensor] = {}
         self.trainer.penalty = self.penalty
 
-    def train(self, stage: sequences.Stage) -> None:
+    def train(self, stage: Stage) -> None:
         environments = stage.environments(NUM_ENVS, autoreset='disabled')
         batch = self.learn(environments, stage.budget)
         if batch:
@@ -159,7 +160,7 @@ class Plaid(FineTuning):
     Reinforcement Learning with Distillation for Multi-Skilled Motion Control. ICLR 2018.
     """
 
-    def train(self, stage: sequences.Stage) -> None:
+    def train(self, stage: Stage) -> None:
         seen = stage.ids[: stage.number + 1]
         before = self.policy()
         distilled = int(DISTILLED * stage.budget) if stage.number else 0
@@ -170,7 +171,7 @@ class Plaid(FineTuning):
             distil(self.trainer, together(stage, seen), experts, distilled)
 
 
-def together(stage: sequences.Stage, ids: tuple[str, ...]) -> Several:
+def together(stage: Stage, ids: tuple[str, ...]) -> Several:
     """Makes `NUM_ENVS` simulations or a few fewer, as many of each environment."""
     each = NUM_ENVS // len(ids)
     return Several([stage.environments(each, id, autoreset='disabled') for id in ids])

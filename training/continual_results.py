@@ -24,7 +24,6 @@ from trl_suite.util import files
 from trl_suite.util.program import begin_script
 
 FOLDER = DOCS / 'continual'
-BEGIN, END = '<!-- results, written by training/continual_results.py -->', '<!-- /results -->'
 LEARNERS = ('Scratch', 'FineTuning', 'EWC', 'Plaid', 'MultiTask')  # the order of tables and colours
 REFERENCE = 'Scratch'
 COLUMNS = (
@@ -196,7 +195,8 @@ def _picture(
 def page(text: str) -> str:
     """Returns the page with the current results."""
     sections = filter(None, map(section, sorted(FOLDER.glob('*/'))))
-    return files.between(text, BEGIN, END, '\n' + '\n\n'.join(sections) + '\n')
+    written = '\n' + '\n\n'.join(sections) + '\n'
+    return files.between(text, 'results', 'training/continual_results.py', written)
 
 
 def main() -> None:

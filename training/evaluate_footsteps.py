@@ -22,6 +22,7 @@ import numpy as np
 import runs
 
 from trl_suite import policies, suite
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.cli.arguments import positive
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.common.footstep_plan import LEFT, RIGHT
@@ -110,7 +111,7 @@ def run(
     spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
 ) -> dict[str, Any]:
     """Runs one episode in every simulation; returns survival, reward, errors and posture."""
-    steps = round(seconds * 30)
+    steps = round(seconds / CONTROL_TIMESTEP)
     environments = VectorEnvironment(
         spec, episodes, 0, seed, autoreset='disabled', step_limit=steps, task_kwargs=options
     )

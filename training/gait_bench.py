@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.controllers import GAIT_TIMESTEP, Parameters, parameters
 from trl_suite.environments import states
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE
+from trl_suite.tasks.gait.rules import LONGEST_CYCLE
 from trl_suite.tasks.gait.task import GaitTask
 from trl_suite.util import errors, files
 from trl_suite.vector import VectorEnvironment
@@ -122,7 +123,9 @@ class Bench:
             duration, failed = task.state.duration[env_ids], task.failed[env_ids]
             elapsed[env_ids] += duration
             now = np.nan_to_num(world.subtree_com[env_ids, root, 0] - start[env_ids])
-            whole = (duration > CYCLE) & (duration < LONGEST_CYCLE * FRAME - GAIT_TIMESTEP)
+            whole = (duration > CYCLE) & (
+                duration < LONGEST_CYCLE * CONTROL_TIMESTEP - GAIT_TIMESTEP
+            )
             cycles[env_ids] += whole & ~failed & (now > distance[env_ids])
             distance[env_ids] = now
             in_time = elapsed[env_ids] < horizon

@@ -131,7 +131,7 @@ def train(
             trainer.learn(trainer.collect())
             trainer.average.update_parameters(trainer.policy)
             bar.update(trainer.samples - before)
-            if trainer.samples // every > before // every:
+            if runs.passed(before, trainer.samples, every):
                 returned, length, _ = (trainer.recent / max(trainer.recent[2], 1)).tolist()
                 curve.append({'samples': trainer.samples, 'return': returned, 'length': length})
                 trainer.recent[:] = 0

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from trl_suite import policies
-from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial import windows
 from trl_suite.util import machine
 
 OBSERVATION_CLIP = 10.0  # in standard deviations
@@ -145,9 +145,7 @@ def visible(blocks: Blocks, inputs: int, view: tuple[float, float] | None) -> np
 def _near(view: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
     """Returns the rows and the columns of a map that are in the view, (SAMPLES,) bool each."""
     ahead, aside = view or (np.inf, np.inf)
-    forward = np.linspace(*spatial_ground.AHEAD, spatial_ground.SAMPLES)
-    to_side = np.linspace(-spatial_ground.ASIDE, spatial_ground.ASIDE, spatial_ground.SAMPLES)
-    return np.abs(to_side) <= aside, forward <= ahead
+    return np.abs(windows.RIGHT) <= aside, ahead >= windows.FORWARD
 
 
 def map_shape(blocks: Blocks, view: tuple[float, float] | None) -> tuple[int, int, int]:
@@ -163,7 +161,7 @@ def map_shape(blocks: Blocks, view: tuple[float, float] | None) -> tuple[int, in
             f'convolutions: the first observations are not maps of the ground: {", ".join(blocks)}'
         )
     rows, columns = (int(part.sum()) for part in _near(view))
-    return size // spatial_ground.SAMPLES**2, rows, columns
+    return size // windows.SAMPLES**2, rows, columns
 
 
 # Policies, the files without PyTorch.

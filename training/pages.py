@@ -21,13 +21,6 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
-def replace(page: pathlib.Path, name: str, program: str, text: str) -> None:
-    """Replaces the text on a page between a mark that names the program and its end."""
-    files.replace_between(
-        page, f'<!-- {name}, written by training/{program}.py -->', f'<!-- /{name} -->', text
-    )
-
-
 @contextlib.contextmanager
 def picture(path: pathlib.Path, *shape: int, **options: Any) -> Iterator[tuple[Any, Any]]:
     """Yields a figure and its axes, (rows, columns), and writes them as .png or .svg.

@@ -30,7 +30,7 @@ from settings import RANDOMIZED, randomized_settings_for
 from train_all import SEED
 
 from trl_suite import evaluation, policies
-from trl_suite.util import errors
+from trl_suite.util import errors, files
 from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
@@ -127,7 +127,7 @@ def main() -> None:
     text = table(entries)
     print(text)
     if arguments.page is not None:
-        pages.replace(arguments.page, 'randomized', 'train_randomized', text)
+        files.replace_between(arguments.page, 'randomized', 'training/train_randomized.py', text)
 
 
 if __name__ == '__main__':

@@ -501,13 +501,16 @@ class PlannerTransferTest(absltest.TestCase):
 class PageTest(FolderTest):
     def test_text_between_marks(self):
         page = self.folder / 'page.md'
-        page.write_text('before\n<a>\nold\n</a>\nafter\n')
-        files.replace_between(page, '<a>', '</a>', r'new \1')
-        self.assertEqual(page.read_text(), 'before\n<a>\nnew \\1\n</a>\nafter\n')
-        for text in ('', '<a>', '</a> <a>'):
+        begin, end = '<!-- a, written by b.py -->', '<!-- /a -->'
+        page.write_text(f'before\n{begin}\nold\n{end}\nafter\n')
+        files.replace_between(page, 'a', 'b.py', r'new \1')
+        self.assertEqual(page.read_text(), f'before\n{begin}\nnew \\1\n{end}\nafter\n')
+        for text in ('', begin, f'{end} {begin}'):
             page.write_text(text)
-            with self.assertRaisesRegex(ValueError, "page.md: expected the lines '<a>' and '</a>'"):
-                files.replace_between(page, '<a>', '</a>', 'new')
+            with self.assertRaisesRegex(
+                ValueError, f"page.md: expected the lines '{begin}' and '{end}'"
+            ):
+                files.replace_between(page, 'a', 'b.py', 'new')
             self.assertEqual(page.read_text(), text)
 
 

@@ -193,7 +193,7 @@ class Body(abc.ABC):
         action_map: ActionMap,
         observation: np.ndarray,
         observed: tuple[Block, ...],
-        about: str = 'com',
+        about_com: bool = True,
     ) -> None:
         """Resolves ids in a compiled world.
 
@@ -202,7 +202,7 @@ class Body(abc.ABC):
           action_map: the map from actions to the actuators of the joints.
           observation: array to which the body's blocks are written, (n, ...).
           observed: the blocks of this array, of which some are the body's.
-          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
+          about_com: whether end effector positions are relative to the centre of mass, not to the root.
         """
         self._world, character = world, self.character
         self.arena.bind(world)
@@ -211,7 +211,7 @@ class Body(abc.ABC):
         self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         mass, scope = world.models[0].body_mass[self.links], f'{character.mjcf_model.model}/'
         self._share = mass / mass.sum()
-        self.ids = self._resolve(about == 'com')
+        self.ids = self._resolve(about_com)
         first = world.control_addresses([scope + action_map.actuators[0]])[0]  # of consecutive ones
         sizes = {block.name: block.size for block in self.blocks}
         self.measurement = allocated(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.describe.common import actions, reward
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
@@ -126,9 +127,9 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
 def time(spec: EnvSpec, task: Any) -> Section:
     """Returns rates, and the duration of a step and an episode."""
     control, physics = 1 / gait.GAIT_TIMESTEP, 1 / task.physics_timestep
-    step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * gait_rules.FRAME:.3g} s'
+    step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * CONTROL_TIMESTEP:.3g} s'
     if task.interface == 'base_action':
-        step = f'{gait_rules.FRAME:.3g} s'
+        step = f'{CONTROL_TIMESTEP:.3g} s'
     return section(
         'Time',
         f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is truncated\n'

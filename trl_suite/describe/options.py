@@ -43,7 +43,7 @@ def disturbances(actuation: str, blocks: Iterable[Block]) -> Iterator[Section]:
         table_of(worlds.WorldConfig),
         'Options of push, in randomize:',
         table_of(pushes.PushConfig),
-        _presets('randomize', worlds.PRESETS),
+        '\n'.join(f'- randomize={name!r}: {dict(v)}' for name, v in worlds.PRESETS.items()),
     )
     yield section(
         'Options of sensors',
@@ -81,12 +81,6 @@ def presets_of_sensors(blocks: Iterable[Block]) -> Table:
     share = ' '.join(f'{value:g}' for value in sensors.TERRAIN_DROPOUT)
     cells.append(('terrain_dropout', '1', share, '', ''))
     return Table(('block', 'unit', 'noise', 'bias', 'delay up to'), cells)
-
-
-def _presets(option: str, presets: Mapping[str, Any]) -> str:
-    """Returns the presets of an option as a list."""
-    lines = [f'- {option}={name!r}: {dict(values)}' for name, values in presets.items()]
-    return '\n'.join(lines)
 
 
 def _shown(value: Any) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite import terrain
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.describe import gait
 from trl_suite.describe.common import REWARD_WEIGHT, actions, floats, reward
 from trl_suite.describe.options import table_of
@@ -211,7 +212,7 @@ def _planning(spec: EnvSpec, task: Any) -> Iterator[Section]:
         yield _goal(spec, task, 'far')
         full = f'the term speed is at its maximum if the step begins within {task.goal_reached:g} m of the goal'
     yield reward(task, f'target speed: {task.config.target_speed:g} m/s', full)
-    every = hierarchical_rules.SAMPLE_FRAMES / 30
+    every = hierarchical_rules.SAMPLE_FRAMES * CONTROL_TIMESTEP
     yield section(
         f'Termination (discount 0), sampled every {every:g} s',
         f'one of {", ".join(task.character.spec.fall_links)} {fall_condition()}; or the physics diverges',

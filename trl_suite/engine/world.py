@@ -21,10 +21,8 @@ from trl_suite.engine import motors, native, pushes
 from trl_suite.util import machine
 from trl_suite.util.compiled import address, packed
 
-# State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
-WRITABLE = (
-    'qpos', 'qvel', 'act', 'ctrl', 'qacc_warmstart', 'mocap_pos', 'mocap_quat', 'xfrc_applied',
-)  # fmt: skip
+# Arrays that tasks may write. After writing any but ctrl, call `World.forward`.
+WRITABLE = ('qpos', 'qvel', 'ctrl')
 # Fields that every task reads. A batch copies its fields after every step: others are optional.
 READABLE = ('xpos', 'xipos', 'cvel', 'subtree_com', 'sensordata', 'ten_length')
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # restores a trajectory bit for bit
@@ -47,12 +45,7 @@ class World:
 
     qpos: np.ndarray
     qvel: np.ndarray
-    act: np.ndarray
     ctrl: np.ndarray
-    qacc_warmstart: np.ndarray
-    mocap_pos: np.ndarray
-    mocap_quat: np.ndarray
-    xfrc_applied: np.ndarray
     xpos: np.ndarray
     xipos: np.ndarray
     cvel: np.ndarray

@@ -14,7 +14,7 @@ import numpy as np
 
 from trl_suite.motion import quaternion
 from trl_suite.tasks.task import Marker, Task
-from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
+from trl_suite.terrain.spatial.windows import FORWARD, RIGHT
 
 Overlay = Callable[[Any, Any], None]
 
@@ -90,9 +90,7 @@ def terrain_samples(task: Any, physics: Any) -> np.ndarray:
         return np.stack([places, np.zeros_like(places), heights], axis=1)
     root = task.body.links[0]
     (x, y, _), heading = physics.data.xpos[root], quaternion.heading(physics.data.xquat[root])
-    aside, ahead = np.meshgrid(
-        np.linspace(ASIDE, -ASIDE, SAMPLES), np.linspace(*AHEAD, SAMPLES), indexing='ij'
-    )
+    aside, ahead = np.meshgrid(-RIGHT, FORWARD, indexing='ij')
     cosine, sine = np.cos(heading), np.sin(heading)
     x = x + cosine * ahead.ravel() - sine * aside.ravel()
     y = y + sine * ahead.ravel() + cosine * aside.ravel()

@@ -15,16 +15,6 @@ network fits all of them.
 `trl_suite.runs` defines learners, samples, seeds and result files.
 """
 
-from trl_suite.runs import (
-    EPISODES,
-    FIRST_TEST_SEED,
-    BudgetExceededError,
-    Learner,
-    Resumable,
-    Stage,
-    test_seeds,
-    train_seeds,
-)
 from trl_suite.sequences.catalogue import BENCHMARK, BUDGETS, SEEDS, SEQUENCES, Sequence
 from trl_suite.sequences.metrics import (
     average_performance,
@@ -40,9 +30,7 @@ get, run, scores = BENCHMARK.get, BENCHMARK.run, BENCHMARK.scores
 read, check, departures = BENCHMARK.read, BENCHMARK.check, BENCHMARK.departures
 
 __all__ = [
-    'BENCHMARK', 'BUDGETS', 'EPISODES', 'FIRST_TEST_SEED', 'SEEDS', 'SEQUENCES',
-    'BudgetExceededError', 'Learner', 'Resumable', 'Sequence', 'Stage', 'average_performance',
+    'BENCHMARK', 'BUDGETS', 'SEEDS', 'SEQUENCES', 'Sequence', 'average_performance',
     'backward_transfer', 'check', 'departures', 'forgetting', 'forward_transfer', 'get',
-    'learning_accuracy', 'learning_transfer', 'metrics', 'read', 'run', 'scores', 'test_seeds',
-    'train_seeds',
+    'learning_accuracy', 'learning_transfer', 'metrics', 'read', 'run', 'scores',
 ]  # fmt: skip

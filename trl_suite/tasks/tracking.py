@@ -56,7 +56,9 @@ class BodyTask(Task):
         the observations of current states, after the bodies were measured.
     """
 
-    ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
+    ABOUT_COM = (
+        True  # whether end effector positions are relative to the centre of mass, not to the root
+    )
     length = 0.0  # m; of the step of a library with which episodes start
     strain = True  # whether the strain of muscles is observed
     body: Any  # PlanarBody or SpatialBody
@@ -310,7 +312,7 @@ class TrackingTask(BodyTask):
         if self.observed != self.full:
             full = np.zeros((world.n, sum(block.size for block in self.full)))
             self.saved = (*self.saved, by_name('Full', {'observation': full}))
-        self.body.bind(world, self.joint_map, full, self.full, self.ABOUT)
+        self.body.bind(world, self.joint_map, full, self.full, self.ABOUT_COM)
         self.reference = self._make_reference()
         none, mirror = np.zeros(0, int), self._reflection if self.mirrored else None
         self._view = View(

@@ -38,7 +38,7 @@ from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
 from trl_suite.terrain.planar.ground import PlanarGround
 from trl_suite.terrain.spatial.features import IDLE
 from trl_suite.terrain.spatial.ground import SpatialGround
-from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
+from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Layout, Movers, boxes
 from trl_suite.terrain.spatial.surroundings import Surroundings, capacity
 
 __all__ = [
@@ -52,7 +52,6 @@ __all__ = [
     'WRITTEN',
     'Belts',
     'Boxes',
-    'Grid',
     'Layout',
     'Movers',
     'Parameter',

@@ -181,12 +181,13 @@ def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
     return path.with_name(f'.{path.stem}.{number}.{kind}{path.suffix.lower()}')
 
 
-def between(page: str, begin: str, end: str, text: str) -> str:
-    """Returns a page with other lines between two marks.
+def between(page: str, name: str, program: str, text: str) -> str:
+    """Returns a page with other lines between the marks of a text that a program writes.
 
     Raises:
       ValueError: the page lacks a mark.
     """
+    begin, end = f'<!-- {name}, written by {program} -->', f'<!-- /{name} -->'
     before, found, rest = page.partition(begin)
     _, ended, after = rest.partition(end)
     if not (found and ended):
@@ -194,10 +195,10 @@ def between(page: str, begin: str, end: str, text: str) -> str:
     return f'{before}{begin}\n{text}\n{end}{after}'
 
 
-def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
-    """Replaces the lines between two marks in a page."""
+def replace_between(path: pathlib.Path, name: str, program: str, text: str) -> None:
+    """Replaces the lines between the marks in a page, see `between`."""
     with errors.naming(path):
-        new = between(path.read_text(encoding='utf-8'), begin, end, text)
+        new = between(path.read_text(encoding='utf-8'), name, program, text)
     with replacing(path) as part:
         part.write_text(new, encoding='utf-8')
 

@@ -27,15 +27,16 @@ from typing import Any
 import mujoco
 
 from trl_suite import policies, suite
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.environments import named_policies
 from trl_suite.environments.arguments import check_seed
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.catalogue import spec_of
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.rendering import overlays, web_scene, web_server
+from trl_suite.rendering import Policy, overlays, web_scene, web_server
 from trl_suite.util import notices, program
 from trl_suite.viewing import panel
-from trl_suite.viewing.session import FRAME, Loaded, Policy, Session
+from trl_suite.viewing.session import Loaded, Session
 
 HOST, PORT = '127.0.0.1', 8080
 EVERY = '0.0.0.0'  # all addresses of this machine
@@ -149,7 +150,7 @@ class Browser:
                     time.sleep(IDLE if not self.playing else min(due - now, IDLE))
                     continue
                 try:
-                    passed = self.session.advance() or FRAME
+                    passed = self.session.advance() or CONTROL_TIMESTEP
                     self._draw()
                 except Exception as error:  # such as an uploaded policy whose numbers overflow
                     self.playing = False

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import collections
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import dm_env
 import mujoco
 import numpy as np
 
+from trl_suite.rendering import Policy
 from trl_suite.rendering.overlays import root_joint
 from trl_suite.util import errors
 from trl_suite.viewing.playback import Playback
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.registry.spec import EnvSpec
 
-Policy = Callable[[dm_env.TimeStep], np.ndarray]
-
-FRAME = 1 / 30  # s of simulated time, at most, between two frames
 HISTORY = 300  # frames in the plots: 10 s
 PUSHES: Mapping[str, tuple[float, float, float]] = {  # directions, in world axes
     'back': (-1, 0, 0),

@@ -159,7 +159,7 @@ def pose_of_step(
     steps: FootstepLibrary, step: int, phase: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns poses with x = y = 0, and rates, at phases (m,) of a step and its mirror image."""
-    times = (2 * phase - np.floor(2 * phase)) * steps.duration
+    times = 2 * phase % 1 * steps.duration
     poses, rates = (part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity))
     poses[:, :2] = 0.0
     return poses, rates

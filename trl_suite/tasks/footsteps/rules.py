@@ -112,17 +112,11 @@ def finish(i: int, data: FootstepData) -> None:
 
 
 @compiled
-def step_phase(phase: float) -> float:
-    """Returns the phase of the single step from the phase of the cycle of two."""
-    return 2 * phase - np.floor(2 * phase)
-
-
-@compiled
 def compare(i: int, data: FootstepData) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
     plan, state, comparison = data.plan, data.state, data.tracking.comparison
     measurement, tracks = data.tracking.measurement, comparison.tracks
-    share = step_phase(data.tracking.clock.phase[i])
+    share = 2 * data.tracking.clock.phase[i] % 1  # of the single step
     row, fraction = moment(share, state.track[i], tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     # The reference was aligned with the heading of the character at the switch of stance.
@@ -204,7 +198,7 @@ def align_all(env_ids: np.ndarray, tracks: np.ndarray, data: FootstepData) -> No
     for k in range(len(env_ids)):
         i = env_ids[k]
         state.track[i] = tracks[k]
-        row, fraction = moment(step_phase(tracking.clock.phase[i]), tracks[k], table)
+        row, fraction = moment(2 * tracking.clock.phase[i] % 1, tracks[k], table)
         turned = tracking.measurement.heading[i] - feature(row, fraction, columns.heading, table)
         x = feature(row, fraction, columns.root, table)
         y = feature(row, fraction, columns.root + 1, table)

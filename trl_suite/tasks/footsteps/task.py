@@ -126,7 +126,7 @@ class Footsteps(PlanTask):
       plans: how they are drawn.
     """
 
-    ABOUT = 'root'
+    ABOUT_COM = False
     finish_all, observe_all = finish_all, observe_all
     plans: Any  # Plans or StraightPlans
     hidden_plan = False
@@ -153,8 +153,7 @@ class Footsteps(PlanTask):
     @property
     def step_phase(self) -> np.ndarray:
         """Share of the single step that has passed, (n,)."""
-        twice = 2 * self.phase
-        return twice - np.floor(twice)
+        return 2 * self.phase % 1
 
     # Episodes.
 

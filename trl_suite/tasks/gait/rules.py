@@ -11,6 +11,7 @@ import numpy as np
 from trl_suite.bodies.blocks import Block
 from trl_suite.bodies.body import BodyData
 from trl_suite.bodies.planar import has_diverged, has_left, measure, observe_body
+from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.bodies.state import FLAG, POINT, REAL, WHOLE
 from trl_suite.characters import CharacterSpec
 from trl_suite.controllers import GAIT_TIMESTEP, gaits
@@ -30,8 +31,7 @@ from trl_suite.util.compiled import compiled
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
 SUBSTEPS = 2  # physics steps, of 1/1200 s, per control step of 1/600 s
-FRAME = 1 / 30  # s; nominal step, and the actual one with interface 'base_action'
-LONGEST_CYCLE = 50  # frames
+LONGEST_CYCLE = 50  # control timesteps
 UPSTREAM_CENTRE = 3.0  # m; boundary of the original's first two segments of ground
 INTERFACES = ('parameters', 'base_action')
 
@@ -53,7 +53,7 @@ TERMS = (  # of the reward of a cycle; weights are those of the character
     ),
 )  # fmt: skip
 
-_FRAME_STEPS = round(FRAME / GAIT_TIMESTEP)
+_FRAME_STEPS = round(CONTROL_TIMESTEP / GAIT_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / GAIT_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / GAIT_TIMESTEP)
 # Why `go_on` returns: the step is over; Python must move the ground window, or call `watch`.

@@ -17,7 +17,7 @@ from trl_suite import actuation
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import PlanarArena
 from trl_suite.bodies.planar import PlanarBody
-from trl_suite.bodies.reference import link_extents
+from trl_suite.bodies.reference import CONTROL_TIMESTEP, link_extents
 from trl_suite.bodies.state import allocated
 from trl_suite.characters import Character
 from trl_suite.controllers import GAIT_TIMESTEP, Gait, dynamics, load
@@ -83,9 +83,7 @@ class GaitTask(Task):
 
     CONFIG: Any = GaitConfig
 
-    def __init__(
-        self, character: Character, arena: PlanarArena, config: GaitConfig = GaitConfig()
-    ) -> None:
+    def __init__(self, character: Character, arena: PlanarArena, config: GaitConfig) -> None:
         """Attaches character and gait to an arena.
 
         Args:
@@ -104,7 +102,7 @@ class GaitTask(Task):
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
         timestep = GAIT_TIMESTEP / config.substeps
-        self.set_timesteps(rules.FRAME, timestep)
+        self.set_timesteps(CONTROL_TIMESTEP, timestep)
         self._torques = actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned for joints without these
             joint.damping = joint.armature = 0

@@ -130,7 +130,7 @@ class HierarchicalNavigation(GoalTask):
       watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """
 
-    ABOUT, RULE = 'root', 'far'
+    ABOUT_COM, RULE = False, 'far'
     finish_all, observe_all = rules.finish_all, rules.observe_all
     length = 0.5
     watch: Callable[[], None] | None = None
@@ -230,7 +230,7 @@ class HierarchicalNavigation(GoalTask):
         self._joint_action = np.zeros((n, len(self.joint_map)))
         # In a step, `rules.observe_for_controller` writes all of this array; elsewhere, `Body.measure`
         # the body's blocks. `rules.observe` writes those of the planner.
-        self.body.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT)
+        self.body.bind(world, self.joint_map, self._controller_observation, blocks, self.ABOUT_COM)
         return rules.PlanningData(
             body=self.body.data,
             outcome=self.outcome,

@@ -147,19 +147,6 @@ class Movers(NamedTuple):
         return way / np.linalg.norm(way, axis=1)[:, None]
 
 
-class Grid(NamedTuple):
-    """Heights of vertices as data: a finite piece of ground, extended by the values at its rim."""
-
-    first: tuple[int, int]  # indices of the first vertex along x and y
-    heights: np.ndarray  # (k, m), along x and y
-
-    def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """Heights of the vertices (i, j) * GRID, (len(i), len(j))."""
-        k, m = self.heights.shape
-        i, j = np.clip(i - self.first[0], 0, k - 1), np.clip(j - self.first[1], 0, m - 1)
-        return self.heights[np.ix_(i, j)]
-
-
 def _misfit(name: str, arrays: Mapping[str, Any]) -> str:
     """Returns which of the arrays of k boxes is not of k finite numbers or pairs; empty if none.
 
@@ -192,7 +179,7 @@ class Layout:
 
     Attributes:
       level: height of a plane under all other parts, m; None for none.
-      grid: a `Grid`, or a function from indices of vertices, (k,) along x and (m,) along y, to
+      grid: a function from indices of vertices, (k,) along x and (m,) along y, to
         their heights, (k, m); linear on two triangles per cell, whose common edge runs from the
         back left to the front right corner. None for none.
       boxes: `Boxes`, or a function from two corners of a rectangle, (2,) each, to the boxes that
@@ -210,7 +197,7 @@ class Layout:
     """
 
     level: float | None = 0.0
-    grid: Grid | GridFunction | None = None
+    grid: GridFunction | None = None
     boxes: Boxes | BoxFunction = NO_BOXES
     belts: Belts | None = None
     movers: Movers | None = None
@@ -283,8 +270,6 @@ class Layout:
             return 'there must be a level, a grid or boxes'
         if self.movers is not None and self.level is None:
             return 'moving boxes need a level to stand on'
-        if isinstance(self.grid, Grid) and not np.isfinite(self.grid.heights).all():
-            return 'grid is not finite'
         arrays = {} if self.movers is None else {'movers': self.movers._asdict()}
         if isinstance(self.boxes, Boxes):
             arrays['boxes'] = self.boxes._asdict()
@@ -296,7 +281,7 @@ class Layout:
 # Fields of a layout: type, and the type in words.
 _PARTS: tuple[tuple[str, Any, str], ...] = (
     ('level', Real | None, 'a number or None'),
-    ('grid', Callable | None, 'a Grid, a function or None'),
+    ('grid', Callable | None, 'a function or None'),
     ('boxes', Boxes | Callable, 'Boxes or a function'),
     ('belts', Belts | None, 'Belts or None'),
     ('movers', Movers | None, 'Movers or None'),

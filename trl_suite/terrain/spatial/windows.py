@@ -29,8 +29,8 @@ ASIDE = 5.5  # m; extent to each side
 SPEED_ERROR = 0.005  # m/s; deviation above which the speed of moving boxes is restored
 REGAINED = 1 / 30  # m/s; at most so much near the character, in each control step
 
-_FORWARD = np.linspace(*AHEAD, SAMPLES)
-_RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
+FORWARD = np.linspace(*AHEAD, SAMPLES)  # m; of the samples of a map
+RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
 _BEHIND = AHEAD[0]
 _PER_METRE_AHEAD = (SAMPLES - 1) / (AHEAD[1] - AHEAD[0])  # samples
 _PER_METRE_ASIDE = (SAMPLES - 1) / (2 * ASIDE)
@@ -397,8 +397,8 @@ def bin_of(distance: float, count: int) -> int:
 def _sample(u: int, v: int, x: float, y: float, cosine: float, sine: float) -> tuple[float, float]:
     """Position of a sample of a map, m."""
     return (
-        x + cosine * _FORWARD[u] + sine * _RIGHT[v],
-        y + sine * _FORWARD[u] - cosine * _RIGHT[v],
+        x + cosine * FORWARD[u] + sine * RIGHT[v],
+        y + sine * FORWARD[u] - cosine * RIGHT[v],
     )
 
 
