@@ -31,7 +31,11 @@ BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_
 
 def core(found: dict[str, Any]) -> str:
     """Returns the table of the core set; how hard each is follows from the best learner's score."""
-    lines = ['| environment | tests | 0 is | 1 is | best learner |', '|--|--|--:|--:|--:|']
+    measured = benchmark.scales()
+    lines = [
+        '| environment | tests | 0 is | 1 is | episodes | best learner |',
+        '|--|--|--:|--:|--:|--:|',
+    ]
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
         best = '–'
@@ -40,7 +44,10 @@ def core(found: dict[str, Any]) -> str:
                 np.mean([run[-1] for run in of['scores'][id]]) for of in found['learners'].values()
             ]
             best = f'{max(scores):.2f}'
-        lines.append(f'| `{id}` | {course.description} | {low:.3f} | {high:.3f} | {best} |')
+        lines.append(
+            f'| `{id}` | {course.description} | {low:.3f} | {high:.3f} '
+            f'| {measured[id]["episodes"]} | {best} |'
+        )
     return '\n'.join(lines)
 
 

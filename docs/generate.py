@@ -327,11 +327,12 @@ def character_index() -> str:
         )
         for name, spec in characters.CHARACTERS.items()
     ]  # fmt: skip
+    still = [name for name, spec in characters.CHARACTERS.items() if spec.clip is None]
     return page(
         'Characters',
         '`suite.build` combines a character with any terrain of the same dimension and with position, '
-        f'velocity or torque control; {", ".join(MUSCLES)} also have muscles. A character without a clip '
-        "needs `task='walk'` or a custom clip. For custom characters see "
+        f'velocity or torque control; {", ".join(MUSCLES)} also have muscles. {", ".join(still)} have no clip: '
+        "they need a custom one, or another task, such as `task='walk'`. For custom characters see "
         '[Make your own](make_your_own.md).',
         table(('character', '', 'description', 'environments'), cells),
     )

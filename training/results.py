@@ -242,7 +242,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'Footstep tracking',
             'By `training/evaluate_footsteps.py`, episodes of 20 s, seed 0: landing error in m, mean and 90th '
             'percentile, and mean heading error in rad. *General*: the plans of the environment, with sharp turns; '
-            '*made from the root*: relative to the root, as in the high-level environments; *pushes*: forces on the '
+            '*made from the root*: relative to the root, as in planning environments; *pushes*: forces on the '
             'torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
             ('condition', 'episodes', 'no fall', 'reward', 'landing', '90 %', 'heading'),
             footstep_rows(),

@@ -49,7 +49,7 @@ def short(id_: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('id', help='of the planned environment')
+    parser.add_argument('id', help='of the planning environment')
     parser.add_argument(
         'controllers', nargs='+', help='ids of the environments of the footstep controllers'
     )

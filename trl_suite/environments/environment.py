@@ -216,7 +216,7 @@ class Environment(composer.Environment):
       blocks: slice of each observation block in the flat vector.
       action_map: the map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`).
       step_limit: steps after which an episode is truncated, or None: control steps of 1/30 s, in
-        planning tasks footsteps, in gaits cycles.
+        planning environments footsteps, in gaits cycles.
       at_limit: whether the last step reached the step or time limit, also if it failed.
     """
 

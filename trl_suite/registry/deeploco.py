@@ -38,7 +38,7 @@ def _step(
     preset: str = 'plane',
     **given: Any,
 ) -> EnvSpec:
-    fits = 'mirrored' not in given and character != 'biped3d_full_mocap'  # planned environments
+    fits = 'mirrored' not in given and character != 'biped3d_full_mocap'  # planning environments
     return _spec(
         ('spatial', 'controller') if fits else ('spatial',),
         id=id_,
