@@ -252,8 +252,8 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
             action = plan(env_ids, stance[env_ids])
         else:
             seen = [observation[env_ids, blocks[name]] for name in blocks if name != 'phase']
-            action = np.clip(dribble(np.concatenate(seen, axis=1)), -1, 1)
-        planned = footsteps.action_offset + footsteps.action_scale * action
+            action = dribble(np.concatenate(seen, axis=1))
+        planned = footsteps.control(action)
         root, yaw = found.root[env_ids], found.heading[env_ids]
         for which in range(2):
             place = root[:, :2] + quaternion.rotate_xy(planned[:, 2 * which : 2 * which + 2], yaw)
@@ -280,8 +280,6 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
             parts['plan'][everyone, slot + 2] = landing[:, which, 2] - found.under
         parts['plan'][:, -1] = wrap(heading - found.heading)
         action = controller(np.concatenate([parts[name] for name in observed], axis=1))
-        angles = targets.action_offset + targets.action_scale * np.clip(action, -1, 1)
-        own = task.action_map
-        return np.clip((angles - own.action_offset) / own.action_scale, -1, 1)
+        return np.clip(task.action_map.action(targets.control(action)), -1, 1)
 
     return policy
