@@ -335,6 +335,19 @@ class BrowserTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, r'seed is -1; expected a seed in \[0, 2\*\*32\)'):
             browser.Browser(DOG, seed=-1, port=0)
 
+    def test_start_and_stop(self):
+        viewer = browser.Browser(DOG, 'zero', port=0)
+        thread = viewer.start()._thread
+        self.assertIs(viewer.start()._thread, thread)
+        viewer.speed = 0
+        time.sleep(0.2)
+        self.assertTrue(thread.is_alive())
+        viewer.stop()
+        self.assertFalse(thread.is_alive())
+        with mock.patch.object(web_server, 'stop_server', wraps=web_server.stop_server) as stop:
+            browser.Browser(DOG, 'zero', port=0).stop()
+        stop.assert_called_once()
+
     def test_the_button_says_what_it_does(self):
         viewer = browser.Browser(DOG, 'zero', port=0)
         self.addCleanup(web_server.stop_server, viewer._server)

@@ -114,6 +114,16 @@ class EvaluateTest(parameterized.TestCase):
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
             self.assertEqual(evaluation.evaluate_all(cases, 3, 2, executor=pool), expected)
 
+    def test_baselines_of_one_environment(self):
+        one, other = (suite.make(FLAT, {'random': seed}) for seed in (5, 6))
+        idle, first, second = named_policies.zero(one), *map(named_policies.random, (one, other))
+        action = idle(None)
+        action += 0.5
+        np.testing.assert_array_equal(idle(None), 0)
+        self.assertNotEqual(first(None).tolist(), second(None).tolist())
+        again = named_policies.random(suite.make(FLAT, {'random': 5}))
+        np.testing.assert_array_equal(named_policies.random(one)(None), again(None))
+
     def test_zero_actions_fall_early(self):
         found = evaluation.evaluate(FLAT, named_policies.zero, 10, factory=True)
         self.assertEqual((found['falls'], found['completion_rate'], found['diverged']), (1, 0, 0))

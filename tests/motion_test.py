@@ -202,6 +202,8 @@ class MirrorTest(absltest.TestCase):
 
     def test_by_name(self):
         clip = planar()
+        with self.assertRaisesRegex(ValueError, 'expected each joint once'):
+            clip.mirrored([('right', 'left'), ('left', 'right')])
         swapped = clip.mirrored([('right', 'left')]).poses
         np.testing.assert_array_equal(swapped, clip.poses[:, [0, 1, 2, 4, 3]])
         clip = steps().clip(0)

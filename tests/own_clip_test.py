@@ -266,6 +266,9 @@ class ReadingTest(ClipTest):
             column, _ = clip.layout.starts(joint)
             found = clip.poses[:, column : column + len(expected)]
             np.testing.assert_allclose(found, [expected] * 2, atol=1e-12)
+        looped = {'Loop': 'wrap', 'CycleSyncRootRot': True, 'Frames': frames}
+        path.write_text(json.dumps(looped))
+        self.assertTrue(retargeting.retarget(retargeting.read(path, PLAIN), PLAIN).turning)
         # The height of the root is that of the character; displacements scale with it.
         size = KinematicViewer(PLAIN).standing()[2] / 0.9
         np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
@@ -295,6 +298,8 @@ class ReadingTest(ClipTest):
         (self.folder / 'note.bvh').touch()
         with self.assertRaisesRegex(FileNotFoundError, "did you mean 'note.bvh'"):
             retargeting.read(self.folder / 'none.bvh', PLAIN)
+        with self.assertRaisesRegex(ValueError, 'rate: not an option of .bvh files'):
+            retargeting.read(self.capture()[0], PLAIN, rate=60)
         for name, text, message, skeleton in UNUSABLE:
             asf = self.folder / 'a.asf' if skeleton else None
             (self.folder / 'a.asf').write_text(skeleton or '')
@@ -376,6 +381,9 @@ class RetargetTest(ClipTest):
         self.assertEqual(found['torso'], 'thorax')
         self.assertEqual((found['left_knee'], found['right_elbow']), ('ltibia', 'rradius'))
         self.assertNotIn('right_hip', found)
+        own = ['Hips', 'Left Knee', 'a{b}']
+        found = retargeting.guess_map(own, ['root', *own[1:]])
+        self.assertEqual(found, {'root': 'Hips', 'Left Knee': 'Left Knee', 'a{b}': 'a{b}'})
 
 
 class CycleTest(parameterized.TestCase):
@@ -395,6 +403,14 @@ class CycleTest(parameterized.TestCase):
             cycles = clip.duration / source.duration
             self.assertAlmostEqual(cycles, round(cycles), delta=0.03, msg=name)
             self.assertAlmostEqual(clip.speed, source.speed, delta=0.05 * source.speed)
+
+    def test_a_somersault_stays_one(self):
+        t = np.linspace(0, 3, 91)
+        poses = np.stack([t, 1 + 0.1 * np.sin(2 * np.pi * t), 2 * np.pi * t], 1)
+        clip = motion.Clip('flip', t, np.c_[poses, 0 * t], 'planar', ('knee',), (1,))
+        for found in (retargeting.cycle(clip, 0, 1), retargeting.cycle(clip)):
+            turns = np.ptp(found.poses[[0, -1], 2]) / (2 * np.pi)
+            self.assertAlmostEqual(turns, round(found.duration), delta=1e-6)
 
     def test_the_ends_meet(self):
         for name, noise in (('biped2d_walk', 0.1), ('biped3d_mocap_walk', 0.0)):
@@ -433,6 +449,7 @@ class CheckTest(parameterized.TestCase):
             (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_nee': 'left_knee'}, "unknown joint of the character 'left_nee'"),
             (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_knee': 'knee'}, "joint of the motion 'knee'; did you mean"),
             (retargeting.retarget, walk, 'dog', 'the root, or all other joints'),
+            (retargeting.retarget, dataclasses.replace(walk, poses=walk.poses - 2 * np.eye(1, walk.poses.shape[1], 1)), 'raptor', 'its root is never above 0'),
             (retargeting.retarget, walk, 'raptor', None, 0, 'scale is 0'), (retargeting.cycle, walk, 0.1, 'both or none'),
             (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1 s'), (retargeting.cycle, short, 'lasts 0.2 s'),
             (motion.read_bvh, __file__, 0.01, 'w', "forward is 'w'"),

@@ -923,7 +923,7 @@ class TaskTest(parameterized.TestCase):
 class WorkingFolderTest(FolderTest):
     """What was read when an environment was built is not read again."""
 
-    @parameterized.parameters('clip', 'terrain', 'controller')
+    @parameterized.parameters('clip', 'terrain', 'controller', 'controllers')
     def test_copies_in_another_folder(self, part):
         motion.load('biped2d_walk').save(self.folder / 'walk.npz')
         (self.folder / 'gaps.json').write_text(
@@ -934,8 +934,10 @@ class WorkingFolderTest(FolderTest):
         )
         with contextlib.chdir(self.folder):
             options = {}
-            if part == 'controller':
-                spec, options = 'PD_Biped3D_HLC_Soccer-v0', {'controller': 'controller.npz'}
+            if part.startswith('controller'):
+                path = pathlib.Path('controller.npz')
+                given = str(path) if part == 'controller' else [path, 'controller.npz']
+                spec, options = 'PD_Biped3D_HLC_Soccer-v0', {'controller': given}
                 environment = suite.make(spec, options)
             else:
                 parts = {part: {'clip': 'walk.npz', 'terrain': 'gaps.json'}[part]}

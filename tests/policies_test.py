@@ -115,6 +115,7 @@ class ActTest(parameterized.TestCase):
         expected = [plain(policy, row) for row in observations]
         actions = policy(observations)
         self.assertEqual((actions.shape, actions.dtype), ((50, 2), np.float64))
+        self.assertEqual(policy(observations[:0]).shape, (0, 2))
         np.testing.assert_allclose(actions, expected, atol=atol)
         if made is make:
             self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all

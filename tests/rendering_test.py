@@ -336,6 +336,10 @@ class FilmStripTest(FolderTest):
         np.testing.assert_array_equal(iio.imread(path), strip)
         self.assert_only('strip.png')
 
+    def test_a_path_is_refused_before_frames_are_drawn(self):
+        with self.assertRaisesRegex(ValueError, 'expected .png'):
+            rendering.film_strip(iter([1]), 'a.jpg')  # 1 is no picture
+
 
 class SpatialTest(FolderTest):
     """What is drawn in three dimensions; footsteps_test has the markers."""
@@ -415,6 +419,8 @@ class ErrorsTest(FolderTest):
         video(r'shape \(8, 8\)', 'a.gif', [np.zeros((8, 8), np.uint8)]),
         video('fps is 0', 'a.mp4', numbered(2), fps=0),
         video('the folder .* does not exist', 'no/a.mp4', numbered(2)),
+        *((lambda _, n=n: next(rendering.frames(task_of_its_own(), None, n)), f'steps is {n}; expected a whole number')
+          for n in (-1, 2.5)),
         strip('at least one frame', []),
         strip('columns is 0', numbered(2), columns=0),
         strip('the same size', [*numbered(1), *numbered(1, 16)]),

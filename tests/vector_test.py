@@ -10,7 +10,7 @@ import numpy as np
 from absl.testing import parameterized
 from helpers import assert_refused
 
-from trl_suite import suite
+from trl_suite import suite, terrain
 from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
@@ -216,6 +216,17 @@ class PartialBatchTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.truncated, [False, True, False])
         np.testing.assert_array_equal(step.reward > 0, [False, True, False])
 
+    def test_a_restored_end_waits_for_its_step(self):
+        ended = VectorEnvironment(FLAT, 3, 1, 0, autoreset='disabled', step_limit=1)
+        environments = VectorEnvironment(FLAT, 3, 1, 0, autoreset='same_step')
+        for each in ended, environments:
+            each.reset()
+            each.step(IDLE)
+        environments.set_state(ended.get_state([1]), [1])
+        step = environments.step(IDLE, [0])
+        np.testing.assert_array_equal(step.info['ended'], [False, False, False])
+        self.assertEqual(environments.core.steps.tolist(), [2, 1, 1])
+
     @parameterized.parameters(1, 2)
     def test_none_of_them(self, num_threads):
         """Loops that reset or step those that a mask names need not ask whether it names any."""
@@ -303,6 +314,36 @@ class RefusalTest(parameterized.TestCase):
             error=TypeError,
         )  # fmt: skip
         self.assertEqual(pickle.dumps(environments.get_state()), before)
+
+    def test_a_reset_that_fails(self):
+        """Seeds stay, and what is half made is not stepped."""
+        broken = []
+
+        def hill(x):
+            if broken:
+                raise RuntimeError('broken')
+            return 0.1 * np.maximum(x, 0)
+
+        ground = terrain.from_function(hill, 'hill', replace=True)
+        spec = suite.combine('biped2d', terrain=ground)
+        environments, single = (
+            VectorEnvironment(spec, 3, 1, 0),
+            suite.build_environment(spec, {}, {}),
+        )
+        seeds = environments.seeds.copy()
+        with self.assertRaisesRegex(ValueError, 'levels'):
+            environments.reset(seed=5, level=3)
+        np.testing.assert_array_equal(environments.seeds, seeds)
+        for each in environments, single:
+            each.reset()
+            broken.append(True)
+            with self.assertRaisesRegex(RuntimeError, 'broken'):
+                each.reset()
+            self.assertTrue(each.core.ended.all())
+            broken.clear()
+        self.assertTrue(single.step(IDLE[0]).first())
+        step = environments.step(np.zeros((3, len(environments.action_map))))
+        self.assertFalse(step.terminated.any())
 
     def test_arguments(self):
         many = 'num_envs is .*; expected a whole number from 1'

@@ -105,12 +105,16 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         `options` may have the 'level' of the environment's `reset`.
         """
         errors.check_known('option of reset', ('level',), *(options or {}))
+        level = (options or {}).get('level')
         if seed is not None:
             arguments.check_seed('seed', seed)
             seed = int(seed)
+        if level is not None:
+            self.environment.task.choose_level([0], [level])
+        if seed is not None:  # after all checks
             self.environment.random_state.seed(seed)
         super().reset(seed=seed)
-        time_step = self.environment.reset((options or {}).get('level'))
+        time_step = self.environment.reset()
         return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:

@@ -124,6 +124,7 @@ class Core:
     def begin(self, ids: np.ndarray) -> None:
         """Begins episodes in some simulations of a vector environment."""
         if len(ids):
+            self.ended[ids] = True  # until the reset has succeeded
             self.task.begin(ids, [self.random[env_id] for env_id in ids.tolist()])
             self.restart(ids)
 
@@ -269,6 +270,8 @@ class Environment(composer.Environment):
         self._mjcf_never_compiled = False
         self._colours = _colours(self._physics.model) if visualize_reward else None
         self.core = Core(task, 'single environment', [self._random_state])
+        if arguments.is_integer(random):
+            self.core.seeds[0] = random
         self.blocks, self.action_map = dict(task.blocks), task.action_map
         # Whether there are hooks to call before or after a step. Checking them takes time.
         self._hooked = any(self._entity_hooks(name) for name in ('before_step', 'after_step'))
@@ -313,11 +316,12 @@ class Environment(composer.Environment):
         with self.core as core:
             if level is not None:
                 core.task.choose_level([0], [level])
-            core.restart(0)
+            core.ended[0] = True  # until the reset has succeeded
             self.at_limit = False
             self._show_reward(0.0)
             # Composer's hooks: that of the task, `Task.initialize_episode`, and those of entities.
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+            core.restart(0)
             if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
             return dm_env.restart(self._observe())

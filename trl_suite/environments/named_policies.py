@@ -22,7 +22,7 @@ POLICIES = ('reference', *policies.VARIANTS, 'clip', 'scripted', 'zero', 'random
 def zero(environments: Any) -> BatchPolicy:
     """Makes a policy that always takes action 0, for a `VectorEnvironment` or an `Environment`."""
     action = np.zeros((environments.task.world.n, len(environments.action_map)))
-    return lambda observation: action
+    return lambda observation: action.copy()
 
 
 def random(environments: Any, seeds: Sequence[int] | None = None) -> BatchPolicy:

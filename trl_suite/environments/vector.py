@@ -176,9 +176,11 @@ class VectorEnvironment:
             if core.fresh and len(ids) < self.num_envs:
                 raise ValueError('the first reset must be of all simulations')
             if seed is not None:
-                self.seed(seed, ids)
+                arguments.all_seeds(seed, self.num_envs)  # raises before anything changes
             if level is not None:
                 core.task.choose_level(ids, level)
+            if seed is not None:
+                self.seed(seed, ids)
             core.share(core.begin, ids)
             return self._blocks(core.task.seen.observation.astype(self.dtype))
 
@@ -234,7 +236,8 @@ class VectorEnvironment:
                 each[resting] = 0
         truncated = self.at_limit & ~terminated
         if self.autoreset == 'same_step':
-            info['ended'] = ended = core.ended.copy()
+            info['ended'] = ended = np.zeros(self.num_envs, bool)
+            ended[stepped] = core.ended[stepped]
             if ended.any():
                 info['final_observation'] = self._blocks(task.seen.observation.astype(self.dtype))
                 core.share(core.begin, ended.nonzero()[0])

@@ -128,6 +128,10 @@ class Mirror:
         for q, v in layout.rotations:
             self._pose_sign[q : q + 4] = QUATERNION
             self._rate_sign[v : v + 3] = SPIN
+        pairs = [*pairs]
+        named = [joint for pair in pairs for joint in pair]
+        if len({*named}) < len(named):
+            raise ValueError(f'pairs are {pairs}; expected each joint once')
         for pair in pairs:
             (q0, v0), (q1, v1) = map(layout.starts, pair)
             size, other = (layout.sizes[layout.joints.index(joint)] for joint in pair)

@@ -334,6 +334,8 @@ class Policy:
 
     def _output(self, flat: np.ndarray) -> np.ndarray:
         seen, left = np.atleast_2d(flat), None
+        if not len(seen):
+            return np.zeros((0, len(self.actions)))
         if self.mirror is not None:
             seen, left = self.mirror.canonical(seen)
         if self.places is not None:

@@ -155,7 +155,11 @@ def played(
     Yields:
       The number of steps so far, every time step, and the action that follows it: zeros at ends of
       episodes.
+
+    Raises:
+      ValueError: steps is not a whole number.
     """
+    steps = checked('steps', steps, int, at_least=0)
     none = np.zeros(environment.action_spec().shape)
     time_step, done = environment.reset(), 0
     while True:

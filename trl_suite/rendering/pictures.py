@@ -43,6 +43,7 @@ def film_strip(
       ValueError: no pictures, pictures of different sizes, columns below 1, or another suffix.
     """
     columns = checked('columns', columns, int, at_least=1)
+    target = None if path is None else check_path(path, IMAGE_SUFFIXES)
     images = [check_image(image) for image in frames]
     if not images:
         raise ValueError('a film strip needs at least one frame')
@@ -52,9 +53,9 @@ def film_strip(
     margin = np.full((len(images[0]), STRIP_MARGIN, 3), 255, np.uint8)
     parts = [part for i in chosen for part in (margin, images[i])]
     strip = np.concatenate(parts[1:], axis=1)
-    if path is not None:
+    if target is not None:
         picture = library('PIL.Image', 'trl_suite[video]').fromarray(strip)
-        with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
+        with replacing(target) as part:
             picture.save(part)
     return strip
 
@@ -94,7 +95,7 @@ def plot_terrain(
     draws = checked('draws', draws, int, at_least=1, at_most=MOST_DRAWS)
     longest = MAX_SPAN if terrain.spatial else 10_000.0
     checked('length', length, float, 'm', above=0, at_most=longest)
-    checked('seed', seed, int, at_least=0)
+    seed = checked('seed', seed, int, at_least=0)
     # `Figure` needs no display and does not affect the user's pyplot.
     make = library('matplotlib.figure', 'trl_suite[video]').Figure
     if terrain.spatial:

@@ -48,7 +48,7 @@ class Replay:
           ValueError: another suffix, an fps that is not positive, or a ghost although the task has
             no reference clip.
         """
-        self._path = None if path is None else check_path(path, REPLAY_SUFFIXES)
+        self._path = None if path is None else check_path(path, REPLAY_SUFFIXES).absolute()
         checked('fps', fps, float, above=0)
         self._overlays = overlays.of_task(environment.task, ghost)
         web_server.load_viser()

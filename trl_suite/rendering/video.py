@@ -51,7 +51,7 @@ class Video:
     _encoder: subprocess.Popen[bytes] | None = None
 
     def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
-        self._path = check_path(path, VIDEO_SUFFIXES)
+        self._path = check_path(path, VIDEO_SUFFIXES).absolute()
         self._fps = checked('fps', fps, float, above=0)
         self._images: list[Any] = []  # of a .gif
         self._h264 = self._path.suffix.lower() == '.mp4'

@@ -42,6 +42,8 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
     layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
     gap = layout.change(poses[-1], poses[0])
     gap[:flat] = 0.0
+    if clip.root == 'planar':  # a somersault ends a turn further
+        gap[2] -= 2 * np.pi * np.round(gap[2] / (2 * np.pi))
     poses = layout.changed(poses, share[:, None] * gap)
     poses[:, :flat] -= poses[0, :flat].copy()
     return dataclasses.replace(clip, times=share * (end - start), poses=poses, loop=True)
@@ -64,6 +66,8 @@ def _alike(clip: Clip) -> tuple[float, float]:
         if not len(later):
             break
         change = clip.layout.change(np.broadcast_to(poses[i], poses[later].shape), poses[later])
+        if clip.root == 'planar':
+            change[:, 2] -= 2 * np.pi * np.round(change[:, 2] / (2 * np.pi))
         difference = (change[:, flat:] ** 2).sum(1) + ((rates[later] - rates[i]) ** 2).sum(1)
         j = int(difference.argmin())
         best = min(best, (float(difference[j]), time, times[later[j]]))

@@ -47,13 +47,16 @@ def read(
         raise ValueError(
             f'{path}: a skeleton ({skeleton}) was given, but the file is not an .amc file'
         )
+    own = {'bvh': ('unit', 'forward', 'up'), 'amc': ('rate', 'unit', 'forward', 'up')}.get(
+        found, ()
+    )
+    if foreign := [name for name in options if name not in own]:
+        raise ValueError(f'{path}: {", ".join(foreign)}: not an option of .{found} files')
     if found == 'bvh':
         return read_bvh(path, **options)
     if found == 'amc':
         assert skeleton is not None
         return read_amc(path, skeleton, **options)
-    if options:
-        raise ValueError(f'{path}: {", ".join(options)}: for .bvh and .amc only')
     if found == 'npz':
         return clips.load(path)
     content = read_json(path)

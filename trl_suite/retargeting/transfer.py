@@ -46,17 +46,22 @@ def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
 
     Joints of the character without a counterpart are omitted.
     """
-    known = {name.rpartition(':')[2].lower().replace(' ', ''): name for name in theirs}
+    known = {_plain(name): name for name in theirs}
     found = {}
     for joint in ours:
-        side = joint.partition('_')[0] if joint.startswith(('left_', 'right_')) else ''
-        usual = NAMES.get(joint.replace(f'{side}_', '{side}_', 1) if side else joint, ())
-        for name in (joint, *usual):
-            name = name.format(side=side, s=side[:1])
+        plain = _plain(joint)
+        side = plain.partition('_')[0] if plain.startswith(('left_', 'right_')) else ''
+        usual = NAMES.get(plain.replace(f'{side}_', '{side}_', 1) if side else plain, ())
+        for name in (plain, *(each.format(side=side, s=side[:1]) for each in usual)):
             if name in known:
                 found[joint] = known[name]
                 break
     return found
+
+
+def _plain(name: str) -> str:
+    """Returns a name without prefix, case and spaces."""
+    return name.rpartition(':')[2].lower().replace(' ', '')
 
 
 def counterparts(
@@ -107,7 +112,8 @@ def retarget(
       A clip in the character's layout; it loops if the motion does.
 
     Raises:
-      ValueError: unknown joints, no root in the map, or a scale that is not positive.
+      ValueError: unknown joints, no root in the map, a scale that is not positive, or none for a clip
+        whose root is never above 0.
     """
     figure = KinematicViewer(character)
     layout = figure.layout
@@ -123,6 +129,8 @@ def retarget(
     else:
         path, turns = _root(motion)
         standing = figure.standing()[1 if layout.root == 'planar' else 2]
+        if scale is None and path[:, 2].max() <= 0:
+            raise ValueError(f'clip {motion.name!r}: its root is never above 0; pass scale=')
         size = standing / path[:, 2].max() if scale is None else scale
     yaw = _yaw(path, turns)
     path = path - [*path[0, :2], 0]
@@ -136,8 +144,9 @@ def retarget(
     height = 1 if layout.root == 'planar' else 2
     poses[:, height] -= np.quantile(_lowest(figure, poses), SINKING)
     kind, loop = (layout.root, layout.joints, layout.sizes), getattr(motion, 'loop', False)
+    turning = layout.root == 'free' and getattr(motion, 'turning', False)
     description = f'{motion.name}, retargeted to {figure.character.spec.name}'
-    return Clip(motion.name, motion.times, poses, *kind, loop, description)
+    return Clip(motion.name, motion.times, poses, *kind, loop, description, turning)
 
 
 def _root(motion: Clip) -> tuple[np.ndarray, np.ndarray]:

@@ -261,7 +261,8 @@ def _user_cache() -> str:
         return os.environ.get('LOCALAPPDATA', '')
     if sys.platform == 'darwin':
         return os.path.expanduser('~/Library/Caches')
-    return os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    found = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    return '' if found.startswith('~') else found  # a user without a home
 
 
 @functools.cache

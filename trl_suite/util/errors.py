@@ -115,6 +115,16 @@ def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
     for key, each in found.items():
         if isinstance(each, Mapping):
             found[key] = options(key, each)
-        elif isinstance(each, str) and each.endswith(('.npz', '.json')):
-            found[key] = os.path.abspath(each)
+        elif isinstance(each, list):
+            found[key] = [*map(_absolute, each)]
+        else:
+            found[key] = _absolute(each)
     return found
+
+
+def _absolute(value: Any) -> Any:
+    """Returns the absolute path of a file, and any other value as it is."""
+    is_path = isinstance(value, os.PathLike)
+    if is_path or (isinstance(value, str) and value.endswith(('.npz', '.json'))):
+        return os.path.abspath(value)
+    return value

@@ -41,6 +41,7 @@ from trl_suite.viewing.session import Loaded, Session
 HOST, PORT = '127.0.0.1', 8080
 EVERY = '0.0.0.0'  # all addresses of this machine
 IDLE = 0.01  # s; longest wait before requests are handled
+LEAST_SPEED = 1e-3  # of the simulation, relative to real time
 PLOT_INTERVAL = 0.25  # s
 PLAN, CLIP, SAMPLES = 'plan and goal', 'reference clip', 'observed terrain'
 DECORATION = {  # visual elements drawn by MuJoCo
@@ -116,6 +117,7 @@ class Browser:
         self._files: dict[str, policies.Policy] = {}  # what .npz files held, by name
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
+        self._begun = False
         spec = spec_of(spec)
         if policy.endswith('.npz'):
             self._files[policy] = policies.load(policy)
@@ -140,7 +142,7 @@ class Browser:
 
     def run(self) -> None:
         """Runs the simulation until `stop` or an interrupt, which is raised; closes the viewer."""
-        due = plotted = 0.0
+        due, plotted, self._begun = 0.0, 0.0, True
         notices.listeners.append(self._panel.notice)
         try:
             while not self._stopped.is_set():
@@ -159,7 +161,7 @@ class Browser:
                     continue
                 # If frames take longer to compute than they last, playback slows down; no frame is
                 # skipped.
-                due = max(now, due) + passed / self.speed
+                due = max(now, due) + passed / max(self.speed, LEAST_SPEED)
                 if now - plotted > PLOT_INTERVAL:
                     plotted = now
                     self._panel.plot(self.session)
@@ -168,7 +170,9 @@ class Browser:
             web_server.stop_server(self._server)
 
     def start(self) -> Browser:
-        """Runs the simulation in a separate thread, and returns the viewer."""
+        """Runs the simulation in a separate thread, if it does not run yet, and returns the viewer."""
+        if self._thread is not None:
+            return self
         self._thread = threading.Thread(target=self.run, daemon=True)
         self._thread.start()
         return self
@@ -178,6 +182,8 @@ class Browser:
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()
+        elif not self._begun:
+            web_server.stop_server(self._server)
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" width="100%" height="600" style="border: none"></iframe>'
