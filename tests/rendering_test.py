@@ -418,6 +418,7 @@ class ErrorsTest(FolderTest):
         video('float64; expected', 'a.gif', [np.zeros((8, 8, 3))]),
         video(r'shape \(8, 8\)', 'a.gif', [np.zeros((8, 8), np.uint8)]),
         video('fps is 0', 'a.mp4', numbered(2), fps=0),
+        video('fps is 200; expected a number above 0 and at most 100', 'a.gif', numbered(2), fps=200),
         video('the folder .* does not exist', 'no/a.mp4', numbered(2)),
         *((lambda _, n=n: next(rendering.frames(task_of_its_own(), None, n)), f'steps is {n}; expected a whole number')
           for n in (-1, 2.5)),

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import subprocess
 from collections.abc import Iterable
 from types import TracebackType
@@ -52,9 +53,9 @@ class Video:
 
     def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
         self._path = check_path(path, VIDEO_SUFFIXES).absolute()
-        self._fps = checked('fps', fps, float, above=0)
-        self._images: list[Any] = []  # of a .gif
+        self._images: list[Any] = []  # of a .gif, whose frames last at least 0.01 s
         self._h264 = self._path.suffix.lower() == '.mp4'
+        self._fps = checked('fps', fps, float, above=0, at_most=math.inf if self._h264 else 100)
         module = 'imageio_ffmpeg' if self._h264 else 'PIL.Image'
         self._library = library(module, 'trl_suite[video]')
         self._shape: tuple[int, ...] | None = None
