@@ -338,6 +338,17 @@ class StrengthTest(parameterized.TestCase):
             found.append(environment.physics.data.ptr.actuator_force)
         np.testing.assert_allclose(found[1], 0.5 * found[0], rtol=1e-9, atol=1e-12)
 
+    def test_limits_by_speed_scale_with_the_factor_of_their_motor(self):
+        environment = make(torque_speed=True, strength=(0.5, 1.5))
+        model, task = environment.physics.model.ptr, environment.task
+        for (_, qvel), _ in each_step(environment, np.zeros(6), 5):
+            for k, name in enumerate(task.character.spec.joints):
+                limit = task.character.torque_limits[k] * environment.info[f'strength_{name}']
+                v = qvel[joint_of(environment, name).dofadr[0]]
+                low, high = model.actuator(f'biped2d/{name}').forcerange
+                self.assertAlmostEqual(high, limit_of(v, limit, 20.0, 1.5), places=9)
+                self.assertAlmostEqual(-low, limit_of(-v, limit, 20.0, 1.5), places=9)
+
     def test_factors_are_drawn_uniformly_and_shown(self):
         options = {'strength': (0.7, 1.3), 'delay': (10, 50)}
         environments = VectorEnvironment(PLANAR, 200, 1, seed=3, task_kwargs={'actuators': options})
@@ -497,6 +508,15 @@ class SeriesTest(parameterized.TestCase):
         before, after = (each.physics.model.ptr for each in (plain, given))
         self.assertAlmostEqual(after.body_mass.sum() / before.body_mass.sum(), 1, delta=1e-4)
         self.assertGreater(after.nexclude, before.nexclude)
+
+
+class SpringTest(parameterized.TestCase):
+    def test_springs_are_damped_as_asked(self):
+        figure, physics = fixed('biped2d', flex=0.5, flex_damping=0.2)
+        model = physics.model.ptr
+        for name, limit in zip(figure.spec.joints, figure.torque_limits, strict=True):
+            dof = model.joint(name + series.FLEX).dofadr[0]
+            self.assertAlmostEqual(model.dof_damping[dof], 0.2 * limit / 0.5)
 
 
 class CompositionTest(parameterized.TestCase):

@@ -47,6 +47,11 @@ class CoreTest(parameterized.TestCase):
         gait = benchmark.get('FSM_Dog2D_Terrain_Mixed-v0')
         stage = runs.Stage(gait, 0, 100, 0, 1)
         self.assertEqual(stage.environments(1).step_limit, core.GAIT_LIMIT)
+        answer = [{'normalized_return': 0.0}]
+        with mock.patch.object(evaluation, 'evaluate_all', return_value=answer) as tests:
+            benchmark.scores('FSM_Dog2D_Terrain_Mixed-v0', np.zeros_like)
+        [(spec, _)] = tests.call_args.args[0]
+        self.assertEqual(spec.step_limit, core.GAIT_LIMIT)
 
 
 class Shipped:
@@ -104,6 +109,13 @@ class VerifyTest(FolderTest):
         # Made on another class of processor, it is within the tolerance.
         self.write(policy=running._sha256(self.stored), cpu='other')
         self.assertEqual(self.verify()[1], running.TOLERANCE)
+
+    def test_another_cpu_is_tolerated_only_so_far(self):
+        scores = [self.result['scores'][0], [self.result['scores'][1][0] - 0.06]]
+        course = self.benchmark.courses[ID]
+        metrics = self.benchmark.measured(course, scores, self.result['initial'])
+        self.write(scores=scores, metrics=metrics, cpu='other')
+        assert_refused(self, (self.verify, r'scores\[-1\] is .*; measured'))
 
     def test_a_policy_of_another_environment_or_none(self):
         policies.save(policies.reference('PD_Dog2D_Gaps_Terrain-v0'), self.stored)

@@ -19,7 +19,7 @@ from helpers import FolderTest, assert_refused, assert_uniform
 
 from trl_suite import evaluation, policies, suite
 from trl_suite.engine import PhysicsWorld, variation
-from trl_suite.tasks.variation import SensorConfig, WorldConfig, worlds
+from trl_suite.tasks.variation import SensorConfig, WorldConfig, sensors, worlds
 from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
@@ -116,13 +116,17 @@ class WorldTest(parameterized.TestCase):
 
     def test_tilted_gravity_in_three_dimensions(self):
         """Its horizontal part points downhill: against the direction of ascent."""
-        x, y, z = variation.tilted(10.0, 0.1, np.pi / 2)
-        np.testing.assert_allclose((x, y, z), (0, -10 * np.sin(0.1), -10 * np.cos(0.1)), atol=1e-12)
+        options = {'gravity': 10.0, 'slope': 0.1, 'slope_direction': np.pi / 2}
+        environment = made('PD_Biped3D_Imitate-v0', randomize=options)
+        environment.reset()
+        expected = 0, -10 * np.sin(0.1), -10 * np.cos(0.1)
+        np.testing.assert_allclose(environment.physics.model.ptr.opt.gravity, expected, atol=1e-12)
 
     @parameterized.parameters(PLANAR, GAIT, MOVERS, BALL, STEPS)
     def test_bodies_and_contacts(self, id_):
         nominal, environment = made(id_), made(id_, randomize={
-            'mass': (0.5, 1.5), 'link_mass': (0.8, 1.2), 'com_offset': 0.05, 'damping': 3.0, 'friction': 0.37,
+            'mass': (0.5, 1.5), 'link_mass': (0.8, 1.2), 'inertia': (0.5, 2.0), 'com_offset': 0.05, 'damping': 3.0,
+            'friction': 0.37,
         })  # fmt: skip
         nominal.reset()
         for _ in range(2):
@@ -135,7 +139,7 @@ class WorldTest(parameterized.TestCase):
         self.assertAlmostEqual(after.body_subtreemass[0], expected.sum(), places=9)
         ratio = after.body_inertia[own] / before.body_inertia[own]
         scale = (after.body_mass[own] / before.body_mass[own])[:, None]
-        np.testing.assert_allclose(ratio, scale.repeat(3, 1))
+        np.testing.assert_allclose(ratio, world['inertia'] * scale.repeat(3, 1))
         offset = after.body_ipos[own[0]] - before.body_ipos[own[0]]
         self.assertAlmostEqual(np.linalg.norm(offset), 0.05)
         np.testing.assert_allclose(offset, world['com_offset'], atol=1e-12)
@@ -370,6 +374,21 @@ class SensorTest(parameterized.TestCase):
             part = found[:, environment.blocks[name]]
             part = part - np.median(part, axis=1, keepdims=True) if name == 'terrain' else part
             self.assertGreater(np.std(part), 0.6 * changed.get(name, preset))
+
+    @parameterized.parameters(*enumerate(('mild', 'robot', 'harsh')))
+    def test_presets_are_those_of_the_blocks(self, level, preset):
+        blocks, stop = suite.build_task(suite.find(TERRAIN3D)).observed, 0
+        exact = np.zeros((1, sum(block.size for block in blocks)))
+        data = sensors.sensor_data(SensorConfig(preset=preset), blocks, exact, False)
+        for block in blocks:
+            part, stop, how = slice(stop, stop + block.size), stop + block.size, block.noise
+            if isinstance(how, str) or not block.size:
+                continue
+            np.testing.assert_array_equal(data.noise[part], how.noise[level])
+            np.testing.assert_array_equal(data.bias[part], how.bias[level])
+            np.testing.assert_array_equal(data.delay[part], [[0, how.delay[level]]] * block.size)
+            missing = sensors.TERRAIN_DROPOUT[level] if how.kind == 'map' else 0
+            np.testing.assert_array_equal(data.dropout[part], missing)
 
     @parameterized.parameters(PLANAR, TERRAIN3D)
     def test_noise_and_bias(self, id_):

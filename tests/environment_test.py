@@ -429,6 +429,18 @@ class EndingTest(parameterized.TestCase):
         environment.reset()
         self.assertEqual(environment.ending, '')
 
+    @parameterized.parameters(
+        ('diverged', {}),
+        ('failed', {'failures': {'now': lambda task: np.ones(task.world.n, bool)}}),
+    )
+    def test_other_causes(self, cause, options):
+        environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 1, **options})
+        environment.reset()
+        if cause == 'diverged':
+            environment.physics.data.qvel[:] = np.nan
+        environment.step(np.zeros(6))
+        self.assertEqual(environment.ending, cause)
+
 
 class HookTest(parameterized.TestCase):
     """Substeps run in C: hooks between them are refused, not forgotten."""

@@ -13,6 +13,7 @@ from helpers import assert_refused
 from programs import GAPS, policy_for
 
 from trl_suite import evaluation, suite
+from trl_suite.engine import world
 from trl_suite.environments import named_policies
 from trl_suite.util import machine
 from trl_suite.vector import VectorEnvironment
@@ -70,6 +71,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual(found['returns'], expected[0])
 
     def test_results_do_not_depend_on_threads_and_chunks(self):
+        self.enterContext(mock.patch.object(world, 'LEAST', 1))  # each simulation on a thread
         policy = make(GAPS)
         expected = evaluation.evaluate(GAPS, policy, 4, 2, num_threads=1)
         self.assertLessEqual(machine.made_with().items(), expected.items())
@@ -123,6 +125,28 @@ class EvaluateTest(parameterized.TestCase):
         self.assertNotEqual(first(None).tolist(), second(None).tolist())
         again = named_policies.random(suite.make(FLAT, {'random': 5}))
         np.testing.assert_array_equal(named_policies.random(one)(None), again(None))
+
+    def test_speed_is_over_simulated_time(self):
+        spec = dataclasses.replace(suite.find(GAIT), step_limit=3)
+        found, time = evaluation.evaluate(spec, named_policies.zero, 2, factory=True), 0.0
+        for seed in found['seeds']:
+            one = suite.make(GAIT, {'random': seed, 'step_limit': 3})
+            time_step = one.reset()
+            while not time_step.last():
+                time_step = one.step(np.zeros(len(one.action_map)))
+            time += one.physics.data.time
+        self.assertAlmostEqual(found['speed'], sum(found['distances']) / time)
+
+    def test_divergence_is_counted(self):
+        def breaking(environments):
+            def act(observation):
+                environments.task.world.qvel[0] = np.nan
+                return np.zeros((2, 11))
+
+            return act
+
+        found = evaluation.evaluate(GAPS, breaking, 2, factory=True)
+        self.assertEqual((found['diverged'], found['fell']), (0.5, [False, True]))
 
     def test_zero_actions_fall_early(self):
         found = evaluation.evaluate(FLAT, named_policies.zero, 10, factory=True)

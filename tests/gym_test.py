@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import warnings
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -17,6 +18,7 @@ from helpers import LONG, assert_refused
 
 from trl_suite import rendering, suite
 from trl_suite.adapters.gym import flat as flat_info
+from trl_suite.engine import world
 from trl_suite.gym import SuiteEnv, SuiteVectorEnv
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -58,6 +60,18 @@ class Same:
         else:
             self.assertEqual(np.asarray(ours).dtype, np.asarray(theirs).dtype, where)
             np.testing.assert_array_equal(ours, theirs, where)
+
+
+class InfoTest(parameterized.TestCase):
+    def test_entries_are_numbers_by_their_names(self):
+        env = SuiteEnv(GAPS, task_kwargs={'randomize': {'friction': (0.5, 1.0)}})
+        env.reset(seed=1)
+        _, reward, *_, info = env.step(np.zeros(11))
+        names = ('pose', 'velocity', 'end_effector', 'com', 'root')
+        terms = {name for name in info if name.startswith('reward_')}
+        self.assertEqual(terms, {f'reward_{name}' for name in names})
+        self.assertAlmostEqual(sum(info[name] for name in terms), reward)
+        self.assertBetween(info['world_friction'], 0.5, 1.0)
 
 
 class SingleTest(Same, parameterized.TestCase):
@@ -224,6 +238,10 @@ class SingleTest(Same, parameterized.TestCase):
 
 class VectorTest(Same, parameterized.TestCase):
     """Simulations against Gymnasium's vector environment of single environments."""
+
+    def setUp(self):
+        super().setUp()
+        self.enterContext(mock.patch.object(world, 'LEAST', 1))  # each simulation on a thread
 
     def pair(self, mode, n=3, seed_list=(5, 9, 11), **options):
         single = {'task_kwargs': SHORT, **options}

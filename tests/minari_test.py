@@ -16,8 +16,10 @@ if importlib.util.find_spec('minari') is None:
     raise unittest.SkipTest('needs minari')
 
 import minari
+from helpers import assert_uniform
 
 from trl_suite.adapters import minari as adapter
+from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_Flat-v0'
 
@@ -35,6 +37,13 @@ class DataSetTest(cli_test.CommandTest):
     def contents(self, name, dataset):
         folder = self.folder / name / dataset / 'data'
         return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def test_every_episode_draws_the_share_of_random_actions(self):
+        environments = VectorEnvironment(ID, 64, 1, seed=0)
+        act, shipped = adapter.mixed(environments), adapter.reference(environments)
+        seen = environments.reset()
+        share = np.mean([(act(seen) != shipped(seen)).any(1) for _ in range(100)], 0)
+        assert_uniform(share, 0, 1)
 
     def test_episodes_are_those_of_gymnasium(self):
         name = adapter.write(ID, 'mixed', 4, seed=3, num_threads=2)

@@ -19,12 +19,15 @@ import own_clip_test
 import trimesh
 from absl.testing import parameterized
 from helpers import FolderTest, assert_refused, in_this_process
+from helpers import ground as heights_at
 
 from trl_suite import characters, cli, engine, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import inspect, model_file
 from trl_suite.describe import tasks
+from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
+from trl_suite.tasks.walk import task as walk
 from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain import generators
 from trl_suite.util import limited, program
@@ -827,7 +830,9 @@ class TaskTest(parameterized.TestCase):
         before = [array.copy() for array in found]
         environment.step(np.ones(environment.action_spec().shape))
         for name, array, expected in zip(names, found, before, strict=True):
-            np.testing.assert_array_equal(array, expected, name)
+            np.testing.assert_array_equal(array, expected, name)  # not a view of what changed
+            if name != 'heading' or '3D' in id:
+                self.assertTrue((getattr(parts, name)(environment.task) != expected).any(), name)
 
     @parameterized.parameters(
         'PD_Biped2D_Gaps_Terrain-v0', 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
@@ -855,6 +860,50 @@ class TaskTest(parameterized.TestCase):
         found, gained = rolled(single, actions[:, 1])
         np.testing.assert_array_equal(found, np.array(seen)[:, 1])
         np.testing.assert_array_equal([r or 0.0 for r in gained], np.array(rewards)[:, 1])
+
+    def test_no_term_is_added_at_a_fall(self):
+        options = {'rewards': {'one': (0.5, lambda task: np.ones(task.world.n))}}
+        many = VectorEnvironment('PD_Biped2D_Gaps_Terrain-v0', 3, 1, 2, task_kwargs=options)
+        many.reset()
+        falls = 0
+        for action in np.random.default_rng(0).uniform(-1, 1, (60, 3, 11)):
+            step = many.step(action)
+            np.testing.assert_array_equal(step.reward[step.terminated], 0)
+            falls += step.terminated.sum()
+        self.assertGreater(falls, 0)
+
+    def test_parts_in_three_dimensions(self):
+        environment = suite.make('PD_Biped3D_Imitate-Hills_Terrain-v0', {'random': 1})
+        environment.reset()
+        task, data = environment.task, environment.physics.data
+        lean = np.array([np.cos(0.2), 0, np.sin(0.2), 0])
+        data.qpos[task.body.pose_qpos[3:7]] = quaternion.multiply(quaternion.about_z(0.7), lean)
+        data.qvel[task.body.pose_dof[:2]] = 0.5, 2.0
+        environment.physics.forward()
+        self.assertAlmostEqual(parts.heading(task)[0], 0.7)
+        self.assertAlmostEqual(parts.upright(task)[0], np.cos(0.4))
+        self.assertAlmostEqual(parts.speed(task)[0], 0.5 * np.cos(0.7) + 2 * np.sin(0.7))
+        x, y, z = data.qpos[task.body.pose_qpos[:3]]
+        under = heights_at(environment, np.array([x]), np.array([y]))[0]
+        self.assertAlmostEqual(parts.height(task)[0], z - under, places=6)
+        self.assertGreater(abs(under), 1e-3)
+        np.testing.assert_array_equal(parts.joint_rates(task)[0], data.qvel[task.body.pose_dof[6:]])
+
+    def test_walk_by_its_definitions(self):
+        environment = suite.build('biped3d', task='walk', task_kwargs={'random': 1})
+        environment.reset()
+        task, data = environment.task, environment.physics.data
+        task.travel.origin[0, 2] = 0.5
+        data.qvel[task.body.pose_dof[:2]] = 0.3, 0.4
+        environment.physics.forward()
+        task.observe()
+        off = 0.5 - parts.heading(task)[0]
+        found = task.observation[0, environment.blocks['target_heading']]
+        np.testing.assert_allclose(found, (np.cos(off), np.sin(off)), atol=1e-9)
+        speed = 0.3 * np.cos(0.5) + 0.4 * np.sin(0.5)
+        self.assertAlmostEqual(walk.speed_ratio(task)[0], speed / task.full_speed)
+        environment.step(np.full(len(environment.action_map), 0.5))
+        self.assertAlmostEqual(environment.info['reward_terms']['low_effort'], 0.1 * 0.75)
 
     def test_values_of_parts_equal_their_definitions(self):
         environment = suite.make('PD_Biped2D_Flat-v0', {'random': 1, **PARTS})

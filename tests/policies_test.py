@@ -661,7 +661,8 @@ class ShippedTest(parameterized.TestCase):
     """`environment_test.py` checks that each fits its environment."""
 
     def test_files_are_small(self):
-        for path in resources.directory('trained').glob('*.npz'):
+        self.assertNotEmpty(paths := [*resources.directory('trained').glob('*.npz')])
+        for path in paths:
             networks = len(policies.load(path).networks)
             self.assertLess(path.stat().st_size, networks * MAX_BYTES, path.name)
 

@@ -17,6 +17,7 @@ from helpers import EVERY_PROPERTY, LONG, advance, assert_rows_are_singles
 
 from trl_suite import motion, suite
 from trl_suite.characters import CHARACTERS
+from trl_suite.engine import world
 from trl_suite.environments import states
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
@@ -191,6 +192,7 @@ class VariantTest(parameterized.TestCase):
             VectorEnvironment(id_, n, threads, seed, task_kwargs=WORLD)
             for threads, seed in ((1, 5), (3, 5), (1, 9))
         )
+        self.enterContext(mock.patch.object(world, 'LEAST', 1))  # all on threads
         action = np.zeros((n, len(one.action_map)))
         for each in one, two, other:
             each.reset()

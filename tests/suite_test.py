@@ -183,6 +183,18 @@ class OptionTest(parameterized.TestCase):
             self.assertEqual(step.last(), last)
 
 
+class FaceTest(parameterized.TestCase):
+    @parameterized.product(
+        id_=('PD_Biped2D_Gaps_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'),
+        length=(None, 0.1),
+    )
+    def test_faces_become_ramps(self, id_, length):
+        environment = suite.make(id_, {'random': 0, 'face_length': length})
+        environment.reset()
+        _, vertical = environment.task.arena.grounds[0].window(0, 4000)
+        self.assertEqual(bool(vertical.any()), length is None)
+
+
 class BuildTest(parameterized.TestCase):
     """Combinations that the catalogue does not name."""
 

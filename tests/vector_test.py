@@ -176,6 +176,8 @@ class PartialBatchTest(parameterized.TestCase):
             np.testing.assert_array_equal(world.qpos[1], before[0])
             np.testing.assert_array_equal(world.qvel[1], before[1])
             self.assertEqual(waiting.reward[1], 0)
+            for term in waiting.info['reward_terms'].values():
+                self.assertEqual(term[1], 0)
             self.assertFalse(waiting.terminated[1] or waiting.truncated[1])
             assert_same(ours.step(action, np.array([False, True, False])), expected, 1, 1)
 
@@ -201,6 +203,12 @@ class PartialBatchTest(parameterized.TestCase):
         for action in actions:
             assert_same(ours.step(action), theirs.step(action))
         np.testing.assert_array_equal(ours.reset(), theirs.reset())
+
+    def test_copies_have_random_streams_of_their_own(self):
+        one, other = (VectorEnvironment(GAPS, 2, 1, seed=4) for _ in range(2))
+        one.reset(), other.reset()
+        one.copy_from(one, [0], [1])
+        np.testing.assert_array_equal(one.reset(), other.reset())
 
     def test_an_ended_simulation_waits_for_its_reset(self):
         environments = VectorEnvironment(GAPS, 3, 1, 0, step_limit=2)

@@ -94,6 +94,7 @@ class OracleTest(absltest.TestCase):
         policy = falling()
         environments = VectorEnvironment(RAPTOR, 2, 1, 0, autoreset='disabled', step_limit=None)
         past, places, _ = oracles.falls(environments, policy, 20)
+        self.assertNotEmpty(past)
         copies = VectorEnvironment(RAPTOR, 2, 1, 1, autoreset='disabled', step_limit=None)
         copies.reset()
         none = np.zeros((20, 2, len(copies.action_map)))
