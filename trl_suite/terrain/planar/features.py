@@ -248,7 +248,7 @@ def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Gen
     """Repeats a feature until the length is reached; every feature has at least one vertex."""
     wanted = missing = cells(length)
     values = np.array([parameters[name] for name in _NAMES[kind]], float)
-    face = cells(parameters['FaceLength'])
+    face = cells(min(max(0.0, parameters['FaceLength']), MOST_LENGTH))  # of users' generators, too
     bits, number = random.address(rng), 0
     runs = Runs(np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing))
     while True:
