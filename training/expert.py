@@ -33,8 +33,9 @@ from trl_suite.vector import VectorEnvironment
 REACH = 5.0  # m; half the map's side
 FINE, COARSE = 0.125, 2  # height spacing, m; node spacing, heights
 LEVEL = 0.12  # m; largest height difference to the goal of level ground
-DISTANCE = 0.85  # m; distance from obstacles below which a path costs more
-PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
+DISTANCE = 1.2  # m; distance from obstacles below which a path costs more
+ROOM = 0.4  # m; distance from obstacles below which a walker does not fit
+PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m without room
 DETOUR = 1.02  # a straight line may cost this many times as much as the path that it replaces
 AHEAD = 4.0  # step lengths; distance of the next point on a trail
 # The same where every goal on the trail is followed by the next one, and the share of the goal's
@@ -189,7 +190,7 @@ def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = Fa
                 off[k] = on_trail(trail, place, goal, ahead, beyond=beyond)
                 continue
             free = apart(env_id, place) if moves else level(env_id, place)
-            cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= 0)
+            cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= ROOM)
             off[k] = map_.aim(cost, goal - place)
             bend = wrap(np.arctan2(off[k, 1], off[k, 0]) - heading[k])
             careful = abs(bend) > BEND or free[map_.middle] < CLOSE
