@@ -509,8 +509,6 @@ class SeriesTest(parameterized.TestCase):
         self.assertAlmostEqual(after.body_mass.sum() / before.body_mass.sum(), 1, delta=1e-4)
         self.assertGreater(after.nexclude, before.nexclude)
 
-
-class SpringTest(parameterized.TestCase):
     def test_springs_are_damped_as_asked(self):
         figure, physics = fixed('biped2d', flex=0.5, flex_damping=0.2)
         model = physics.model.ptr

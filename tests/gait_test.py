@@ -496,7 +496,7 @@ DO_NOT_FIT = (
 )
 
 
-class LevelTest(parameterized.TestCase):
+class OptionTest(parameterized.TestCase):
     @parameterized.parameters((0.0, 0.1, 0.3), (1.0, 0.6, 1.4))
     def test_terrain_level(self, level, low, high):
         options = {'random': 0, 'terrain_level': level}
@@ -507,8 +507,6 @@ class LevelTest(parameterized.TestCase):
         widths = np.diff(edges)[heights[edges[:-1]] < -1]
         self.assertBetween(widths.mean() * terrain.SPACING, low, high)
 
-
-class OptionTest(parameterized.TestCase):
     def test_refused(self):
         assert_refused(
             self,

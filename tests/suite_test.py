@@ -182,8 +182,6 @@ class OptionTest(parameterized.TestCase):
             step = environment.step(np.zeros(environment.action_spec().shape))
             self.assertEqual(step.last(), last)
 
-
-class FaceTest(parameterized.TestCase):
     @parameterized.product(
         id_=('PD_Biped2D_Gaps_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'),
         length=(None, 0.1),

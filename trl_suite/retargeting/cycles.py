@@ -40,13 +40,19 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
     share = np.linspace(0, 1, max(3, round((end - start) / step) + 1))
     poses = clip.pose(start + share * (end - start))
     layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
-    gap = layout.change(poses[-1], poses[0])
+    gap = _change(clip, poses[-1], poses[0])
     gap[:flat] = 0.0
-    if clip.root == 'planar':  # a somersault ends a turn further
-        gap[2] -= 2 * np.pi * np.round(gap[2] / (2 * np.pi))
     poses = layout.changed(poses, share[:, None] * gap)
     poses[:, :flat] -= poses[0, :flat].copy()
     return dataclasses.replace(clip, times=share * (end - start), poses=poses, loop=True)
+
+
+def _change(clip: Clip, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Returns changes between poses without whole turns of a planar root: a somersault ends one further."""
+    change = clip.layout.change(before, after)
+    if clip.root == 'planar':
+        change[..., 2] -= 2 * np.pi * np.round(change[..., 2] / (2 * np.pi))
+    return change
 
 
 def _alike(clip: Clip) -> tuple[float, float]:
@@ -65,9 +71,7 @@ def _alike(clip: Clip) -> tuple[float, float]:
         later = np.flatnonzero((times >= time + CYCLE[0]) & (times <= time + CYCLE[1]))
         if not len(later):
             break
-        change = clip.layout.change(np.broadcast_to(poses[i], poses[later].shape), poses[later])
-        if clip.root == 'planar':
-            change[:, 2] -= 2 * np.pi * np.round(change[:, 2] / (2 * np.pi))
+        change = _change(clip, np.broadcast_to(poses[i], poses[later].shape), poses[later])
         difference = (change[:, flat:] ** 2).sum(1) + ((rates[later] - rates[i]) ** 2).sum(1)
         j = int(difference.argmin())
         best = min(best, (float(difference[j]), time, times[later[j]]))
