@@ -8,6 +8,7 @@ Needs `pip install 'trl_suite[benchmark]'`.
 
 import numpy as np
 import stable_baselines3
+import stable_baselines_state
 import torch
 from stable_baselines3.common import utils
 from stable_baselines_export import exported
@@ -15,7 +16,6 @@ from stable_baselines_export import exported
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
 
 ENVS = 8  # simulations; SAC, TD3 and TQC make one update after each step of all
-BUFFER = ('observations', 'next_observations', 'actions', 'rewards', 'dones', 'timeouts')
 
 
 class PPO:
@@ -39,19 +39,10 @@ class PPO:
         return exported(self.model, self.spaces.environment)
 
     def save(self, folder):
-        self.model.save(folder / 'model.zip')
-        if buffer := getattr(self.model, 'replay_buffer', None):  # without what is still empty
-            filled = {name: getattr(buffer, name)[: buffer.size()] for name in BUFFER}
-            np.savez(folder / 'buffer.npz', next=buffer.pos, **filled)
+        stable_baselines_state.save(self.model, folder / 'state.pt')
 
     def load(self, folder):
-        self.model = self.kind.load(folder / 'model.zip', self.spaces, device='cpu')
-        if buffer := getattr(self.model, 'replay_buffer', None):
-            with np.load(folder / 'buffer.npz') as saved:
-                buffer.pos = int(saved['next'])
-                buffer.full = len(saved['dones']) == buffer.buffer_size
-                for name in BUFFER:
-                    getattr(buffer, name)[: len(saved[name])] = saved[name]
+        stable_baselines_state.load(self.model, folder / 'state.pt')
 
 
 class SAC(PPO):

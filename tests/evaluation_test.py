@@ -167,6 +167,8 @@ class EvaluateTest(parameterized.TestCase):
         self.assertGreater(found['normalized_return'], 0.3)
 
     def test_a_time_limit_counts_as_its_steps(self):
+        short = evaluation.evaluate(GAPS, make(GAPS), 1, task_kwargs={'time_limit': 1e-9})
+        self.assertEqual(short['step_limit'], 1)
         found = evaluation.evaluate(GAPS, make(GAPS), 4, task_kwargs={'time_limit': 0.1})
         self.assertEqual((found['step_limit'], found['lengths']), (3, [3] * 4))
         self.assertEqual(found['normalized_return'], found['return'] / 3)

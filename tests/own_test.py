@@ -244,6 +244,15 @@ class CharacterTest(WrittenTest):
         model = self.with_mesh('leg.dae')
         np.testing.assert_allclose(model.geom_size[1], [5e-4, 5e-4, 2e-3], atol=1e-7)
 
+    @parameterized.parameters(
+        ('<!DOCTYPE COLLADA [<!ENTITY a "1 2 3">]><COLLADA/>', 'expected no document type'),
+        ('<COLLADA', 'leg.dae'),
+    )
+    def test_collada_files_that_are_refused(self, text, message):
+        self.write(text, 'leg.dae')
+        with self.assertRaisesRegex(ValueError, f"mesh 'leg' of 'leg': .*{message}"):
+            self.with_mesh('leg.dae')
+
     def test_without_a_reader_of_collada_the_remedy_is_named(self):
         self.write('<COLLADA/>', 'leg.dae')
         with (
@@ -722,6 +731,7 @@ class TerrainTest(WrittenTest):
         self.write('nothing', 'broken.png')
         self.write('v -1 -1\nv 1 -1\nv 0 1\nf 1 2 3\n', 'plane.obj')
         terrain.from_function(lambda x: x, 'wedge')
+        cliff = terrain.from_function(lambda x: 1e300 * np.sign(x - 0.4), 'cliff')
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
         assert_refused(
             self,
@@ -731,6 +741,8 @@ class TerrainTest(WrittenTest):
             (lambda: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),
             (lambda: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
             (lambda: terrain.PlanarGround(hole, 0).height(5.0), "terrain 'hole' returned nan at x = 3.* m; expected"),
+            (lambda: terrain.PlanarGround(cliff, 0).height(5.0), "terrain 'cliff' returned .*; expected finite heights up to 1e.06 m"),
+            (lambda: terrain.from_heights(np.zeros(5), 1, first=10**30), 'first is .1.*; expected'),
             (lambda: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
             (lambda: terrain.from_heights([0, np.nan], 1), r'heights: nan at \[1\]; expected finite'),
             (lambda: terrain.from_heights([0, 0], 0), 'spacing is 0'),
@@ -957,7 +969,9 @@ class TaskTest(parameterized.TestCase):
 
         assert_refused(self, *((lambda o=o: step(o), message) for o, message in (
             ({'rewards': {'a': (1, parts.joint_angles)}}, r"reward 'a' has shape \(1, 11\)"),
-            ({'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is not finite"),
+            ({'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is .inf.; expected finite numbers up to 1e.30"),
+            ({'rewards': {'a': (1e300, lambda t: np.full(1, 1e10))}}, "reward 'a' is .inf.; expected finite"),
+            ({'observations': {'a': (1, lambda t: np.full(1, 1e39))}}, "observation 'a' is .1.e.39.; expected finite"),
             ({'observations': {'a': (-5, parts.speed)}}, "size of observation 'a' is -5; expected a whole number at least 1"),
             ({'observations': {'pose': (1, parts.speed)}}, "already has a block 'pose'"),
             ({'rewards': {'a': parts.speed}}, r'expected \(weight, function\)'),

@@ -372,6 +372,8 @@ class ActTest(parameterized.TestCase):
         (make_convolving, {'origin': 13}, 'origin: is 13; expected a number of 0 to 12'),
         (make_convolving, {'line': 14}, 'line: has 14 of 13 inputs'),
         (make_convolving, {'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
+        (make_convolving, {'line': 60_000, 'weights': [np.zeros((3000, 1, 4)), np.zeros((2, 4, 5))]},
+         r'filter_0: its windows have 8.55e\+07 numbers in all; expected at most 1e\+06'),
         (make_seeing, {'grid': (7, 6)}, r'grid: \(7, 6\) does not divide 60 inputs'),
         (make_seeing, {'grid': (60,)}, r'grid: \(60,\) does not divide'),
         (make_seeing, {'grid': (0, 6)}, r'grid: \(0, 6\) does not divide'),

@@ -3,10 +3,12 @@
 `benchmark_test` has what only the benchmark does.
 """
 
+import contextlib
 import copy
 import json
 import os
 import pathlib
+import shutil
 import sys
 from unittest import mock
 
@@ -407,19 +409,39 @@ class RunTest(RunCase):
         self.assertTrue((self.folder / 'result.stage0' / 'own').exists())
 
     def test_what_killed_runs_left_is_removed(self):
-        """Also by a process with the same number, as in a container that is started again."""
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Keeper(1))
-        (self.folder / 'result.stage2').mkdir()
-        part = self.folder / f'.result.stage2.{os.getpid()}.part'
-        part.mkdir()
-        (part / 'history.json').write_text('half')
+        shutil.copytree(self.folder / 'result.stage1', self.folder / 'result.stage2')
         (self.folder / '.result.json.lock').write_text('1234')
         self.assertLen(self.run_short(Keeper())['scores'], 3)
         self.assert_only('result.json')
-        (self.folder / 'result.stage1').mkdir()  # it was killed after its last stage
-        self.run_short(Keeper())
-        self.assert_only('result.json')
+
+    @parameterized.parameters(1, 2)
+    def test_folders_of_the_user_are_not_removed(self, stage):
+        with self.assertRaises(KeyboardInterrupt):
+            self.run_short(Keeper(2))
+        own = self.folder / f'result.stage{stage}'
+        shutil.rmtree(own, ignore_errors=True)
+        own.mkdir()
+        (own / 'thesis.tex').touch()
+        with contextlib.suppress(OSError):  # also of the learner, which does not find its state
+            self.run_short(Keeper())
+        self.assertTrue((own / 'thesis.tex').exists())
+
+    @parameterized.parameters('link', 'text', 'pipe')
+    def test_a_lock_file_that_the_suite_has_not_made(self, kind):
+        own, lock = self.folder / 'own', self.folder / '.result.json.lock'
+        own.write_text('my notes\n')
+        {
+            'link': lambda: lock.symlink_to(own),
+            'text': lambda: lock.write_text('my notes\n'),
+            'pipe': lambda: os.mkfifo(lock),
+        }[kind]()
+        with self.assertRaisesRegex(OSError, r'\.result\.json\.lock'):
+            self.run_short(Keeper())
+        self.assertTrue(os.path.lexists(lock))
+        for path in (own, *([lock] if kind == 'text' else [])):
+            self.assertEqual(path.read_text(), 'my notes\n')
 
     def test_samples_beyond_the_budget_or_after_a_stage_are_refused(self):
         class Greedy(Counter):
@@ -472,8 +494,11 @@ class RunTest(RunCase):
                 "'mine': PD_Biped2D_Flat_Terrain-v0 has other observations or actions",
             ),
         )
-        with self.assertRaisesRegex(TypeError, 'expected the methods train and policy'):
-            self.run_short(object())
+        for wrong in (object(), Counter):
+            with self.assertRaisesRegex(
+                TypeError, 'expected an object with methods train and policy'
+            ):
+                self.run_short(wrong)
         self.path.write_text('{"scores": 3}')
         assert_refused(self, (run(Counter()), 'result.json: format is missing'))
 

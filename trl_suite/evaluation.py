@@ -188,6 +188,7 @@ def _run(
                     f'are divided, since steps of {id_} differ in duration'
                 )
             steps = math.ceil(environments.time_limit / environments.control_timestep - 1e-6)
+            steps = max(1, steps)  # an episode ends after a step
             step_limit = steps if step_limit is None else min(step_limit, steps)
         if step_limit is None:
             raise ValueError(f'{id_} has no step limit, so its episodes may never end')

@@ -104,6 +104,18 @@ def _is_foreign(path: pathlib.Path) -> bool:
     return head.startswith(b'solid') and not binary
 
 
+def _unit(path: pathlib.Path) -> float:
+    """Returns the unit of a COLLADA file, m; programs of ROS apply it, and ignore its up axis."""
+    try:
+        tree = etree.parse(path, etree.XMLParser(resolve_entities=False))
+    except etree.XMLSyntaxError as error:
+        raise ValueError(f'{path}: cannot be read as a mesh ({error})') from None
+    if tree.docinfo.doctype:
+        raise ValueError(f'{path}: expected no document type, which may define entities')
+    meter = tree.find('{*}asset/{*}unit')
+    return 1.0 if meter is None else float(meter.get('meter', 1))
+
+
 def _triangles(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     """Returns corners (k, 3) m and faces (m, 3) of a mesh that trimesh reads."""
     import trimesh  # takes time, and few files need it
@@ -115,10 +127,7 @@ def _triangles(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
             f'{path}: {libraries.missing("pycollada", "pycollada")}, or convert the mesh to .stl '
             'or .obj'
         )
-    triangles, unit = read_triangles(path), 1.0
-    if path.suffix.lower() == '.dae':  # programs of ROS apply its unit, and ignore its up axis
-        parser = etree.XMLParser(resolve_entities=False)
-        meter = etree.parse(path, parser).find('{*}asset/{*}unit')
-        unit = 1.0 if meter is None else float(meter.get('meter', 1))
+    unit = _unit(path) if path.suffix.lower() == '.dae' else 1.0
+    triangles = read_triangles(path)
     corners, faces = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     return unit * corners, faces.reshape(-1, 3)

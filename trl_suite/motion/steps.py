@@ -36,6 +36,7 @@ FEATURES = (
 )  # m, m, m, m, m, m, rad; for a walker in right stance
 WEIGHTS = (*[0.54] * 6, 0.48)  # of the features, 1/m and 1/rad
 _REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # signs of features in left stance
+MOST_STEPS = 10_000
 _FIELDS = archive.forms(
     'labels fiu 2, times fiu 1, poses fiu 3, joints U 1, sizes iu 1, previous fiu 2, features fiu 2, '
     'description U 0'
@@ -84,8 +85,10 @@ class FootstepLibrary:
         put('sizes', tuple(map(int, self.sizes)))
         put('times', errors.floats(f'{what}, times', self.times))
         put('poses', errors.floats(f'{what}, poses', self.poses))
-        if self.poses.ndim != 3 or not len(self.poses):
-            raise ValueError(f'{what}, poses: has shape {self.poses.shape}; expected (k, n, d)')
+        if self.poses.ndim != 3 or not 0 < len(self.poses) <= MOST_STEPS:
+            raise ValueError(
+                f'{what}, poses: has shape {self.poses.shape}; expected (k, n, d), k at most {MOST_STEPS}'
+            )
         two = self.left_poses is not None
         if two:
             own = errors.floats(f'{what}, left_poses', self.left_poses, self.poses.shape)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from trl_suite.policies import checks
+
+MOST = 10**6  # numbers in all windows of a layer, of one simulation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,6 +80,10 @@ class Convolution:
                     f'{stride} on {" x ".join(map(str, positions))} positions'
                 )
             positions = tuple((p - w) // stride + 1 for w, p in zip(window, positions, strict=True))
+            if (size := math.prod((*positions, *window, channels))) > MOST:
+                raise ValueError(
+                    f'filter_{i}: its windows have {size:.3g} numbers in all; expected at most {MOST:g}'
+                )
             channels = filters
         put('weights', tuple(weights))
         put('biases', tuple(biases))

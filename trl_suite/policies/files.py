@@ -36,6 +36,7 @@ SHARED = 'shared.json'  # in trained/; see its README
 # Folders in trained/, with other policies of some environments.
 VARIANTS = 'randomized', 'generalist'
 VERSION = 1
+LARGEST = 2**26  # bytes of the arrays; checks of a policy need several times as many
 _FIELDS = archive.forms(
     'format U 0, version iu 0, id U 0, block_names U 1, block_sizes iu 1, actions U 1, quantity U 0, '
     'mean f 1, std f 1, clip f 0, activation U 0, layers iu 0, log_std f 1, info U 0'
@@ -90,7 +91,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
       FileNotFoundError: there is no such file.
     """
     path = existing(path, ('.npz',))
-    arrays = archive.arrays(path, 'policy')
+    arrays = archive.arrays(path, 'policy', LARGEST)
     with errors.naming(path, Exception):  # wrong numbers raise others than ValueError
         return _policy(arrays)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.rendering.pictures import REPLAY_SUFFIXES
-from trl_suite.util.files import Path, check_path, replacing
+from trl_suite.util.files import Path, check_path, write_text
 from trl_suite.util.options import checked
 
 if TYPE_CHECKING:
@@ -91,8 +91,7 @@ class Replay:
                 self._recording.insert_sleep(self._seconds)
                 self.html = self._recording.as_html()
                 if self._path is not None:
-                    with replacing(self._path) as part:
-                        part.write_text(self.html, encoding='utf-8')
+                    write_text(self.html, self._path)
         finally:
             web_server.stop_server(self._server)
 

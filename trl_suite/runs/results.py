@@ -41,7 +41,7 @@ from trl_suite.util.options import checked
 ROWS = ('scores', 'samples', 'curves', 'seconds')  # lists with one entry per stage
 MADE_WITH = ('mujoco', 'cpu')
 MOST_SAMPLES = LARGEST_SEED = 2**53  # whole numbers that JSON's readers agree on
-LEARNER = re.compile(r'[\w.]+:[\w.<>]+')  # module and class, as Python names them
+LEARNER = re.compile(r'[\w.]+:(\w+(\.<locals>)?\.)*\w+')  # module and class, as Python names them
 
 
 def digest(result: dict[str, Any]) -> str:
@@ -115,7 +115,7 @@ class Format:
             and what was expected.
           OSError: the file cannot be read.
         """
-        result = files.read_json(files.existing(path, ('.json',)))
+        result = files.read_json(files.existing(path, ('.json',)), files.without_repetition)
         with errors.naming(path):
             self.check(result, complete)
         return result

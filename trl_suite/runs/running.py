@@ -8,6 +8,8 @@ import hashlib
 import os
 import pathlib
 import shutil
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
@@ -24,6 +26,7 @@ from trl_suite.util import errors, files, machine
 from trl_suite.util.options import checked
 
 SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
+MARK = '.trl_suite_state'  # file in the folder of a learner's state; other folders are not removed
 TOLERANCE = 0.05  # of scores that are measured again on another class of CPU
 
 
@@ -114,14 +117,18 @@ class Benchmark(results.Format):
                 f'{course.name!r} is a {self.field} of the benchmark with other contents; expected '
                 'another name'
             )
+        if course.name not in self.courses:
+            self.custom(course.name, course.ids)
         course.check_alike()
         count = len(course.stages)
         stages = checked(
             'stages', count if stages is None else stages, int, at_least=1, at_most=count
         )
         kind = type(learner)
-        if not isinstance(learner, Learner):
-            raise TypeError(f'learner is a {kind.__name__}; expected the methods train and policy')
+        if isinstance(learner, type) or not isinstance(learner, Learner):
+            raise TypeError(
+                f'learner is {learner!r}; expected an object with methods train and policy'
+            )
         path = files.check_path(path, ('.json',))
         result: dict[str, Any] = {
             'format': self.format, 'trl_suite': trl_suite.__version__, **machine.made_with(),
@@ -134,6 +141,10 @@ class Benchmark(results.Format):
         with files.locked(path.with_name(f'.{path.name}.lock'), what):
             if path.exists():
                 result = self._resumed(path, result, learner, count)
+                if len(result['scores']) >= stages:
+                    if progress:
+                        print(f'{path} is finished; remove it to run again', file=sys.stderr)
+                    return result
             else:
                 # Else a folder or a policy of the user would be removed.
                 for own in (path.with_suffix('.npz'), *(_state(path, n) for n in range(1, count))):
@@ -194,8 +205,12 @@ class Benchmark(results.Format):
 
         Returns:
           Mean return over the step limit for each environment, (T,).
+
+        Raises:
+          ValueError: invalid numbers.
         """
         course = self.get(course) if isinstance(course, str) else course
+        seed = checked('seed', seed, int, at_least=0, at_most=results.LARGEST_SEED)
         seeds = test_seeds(episodes, seed)
         cases = [(course.spec(id), policy) for id in course.ids]
         found = evaluation.evaluate_all(cases, episodes, seeds, num_threads, executor=executor)
@@ -281,23 +296,26 @@ def _state(path: pathlib.Path, done: int) -> pathlib.Path:
 def _forget(path: pathlib.Path, done: int) -> None:
     """Removes the learner's states before the last of these stages, which are obsolete."""
     for earlier in range(1, done):
-        shutil.rmtree(_state(path, earlier), ignore_errors=True)
+        _remove(_state(path, earlier))
+
+
+def _remove(folder: pathlib.Path) -> None:
+    """Removes a learner's state, and no other folder."""
+    if (folder / MARK).is_file():
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary folder that replaces `path` if no exception is raised."""
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    # A killed process with the same number, as in a restarted container, may have left one.
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
+    prefix = f'.{path.name}.'
+    with tempfile.TemporaryDirectory(prefix=prefix, suffix='.part', dir=path.parent) as outer:
+        part = pathlib.Path(outer, path.name)
+        part.mkdir()
         yield part
-        # Left by a run that was interrupted before it wrote its result.
-        shutil.rmtree(path, ignore_errors=True)
+        (part / MARK).touch()
+        _remove(path)  # left by a run that was interrupted before it wrote its result
         os.replace(part, path)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _write(path: pathlib.Path, result: dict[str, Any]) -> None:

@@ -185,7 +185,8 @@ def from_heights(
         corner = -(np.array(heights.shape) // 2)
     else:
         given = (first,) if errors.is_number(first) else first
-        corner = np.array(checked(f'{name}: first', given, Sequence[int]), int)
+        most = {'at_least': -LARGEST, 'at_most': LARGEST}
+        corner = np.array(checked(f'{name}: first', given, Sequence[int], **most), int)
     if corner.shape != (heights.ndim,):
         raise ValueError(
             f'{name}: first is {first}; expected a number for each of {heights.ndim} axes'

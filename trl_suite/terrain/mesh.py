@@ -181,6 +181,8 @@ def read_triangles(file: pathlib.Path) -> np.ndarray:
             content = _triangles_only(content)
         elif kind == 'stl' and content.lower().count(b'endsolid') > MOST_PARTS:
             raise ValueError(f'expected at most {MOST_PARTS} solids')
+        elif kind == 'ply':
+            _check_ply(content)
         elif kind == 'gltf':
             _check_gltf(content)
         elif kind == 'glb':  # begins with five numbers; the fourth is the length of its JSON
@@ -203,6 +205,16 @@ def _triangles_only(content: bytes) -> bytes:
     """Returns the vertices and faces of an .obj, without groups, materials and texture coordinates."""
     text = content.replace(b'\r\n', b'\n').replace(b'\\\n', b'')
     return re.sub(rb'/\S*', b'', b'\n'.join(re.findall(rb'^[vf][ \t].*', text, re.MULTILINE)))
+
+
+def _check_ply(content: bytes) -> None:
+    """Refuses elements that are not used: one edge may ask for any amount of memory."""
+    elements = re.findall(
+        rb'^\s*element\s+(\S+)', content.partition(b'end_header')[0], re.MULTILINE
+    )
+    for name in elements:
+        if name not in (b'vertex', b'face'):
+            raise ValueError(f'expected the elements vertex and face, not {name.decode()!r}')
 
 
 class _Buffers:
@@ -247,6 +259,8 @@ def _check_gltf(content: bytes) -> None:
         raise ValueError(
             f'expected at most {LARGEST:.3g} numbers in all, and {MOST_PARTS} meshes and nodes'
         )
+    if any('bufferView' not in each for each in tree.get('accessors', ())):  # zeros without bytes
+        raise ValueError('expected a bufferView in each accessor')
 
 
 def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

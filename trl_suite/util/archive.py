@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.util.files import check_size, read_bytes, replacing
+from trl_suite.util.files import LARGEST, check_size, read_bytes, replacing
 
 MOST_EMPTY = 10**6  # elements of an array without content
 
@@ -33,7 +33,7 @@ def forms(text: str) -> Forms:
     return {name: (kinds, int(axes)) for name, kinds, axes in parts}
 
 
-def arrays(path: pathlib.Path, what: str) -> dict[str, np.ndarray]:
+def arrays(path: pathlib.Path, what: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
     """Returns the arrays of an archive by name; `what` is what it should contain, for messages.
 
     Raises:
@@ -45,7 +45,7 @@ def arrays(path: pathlib.Path, what: str) -> dict[str, np.ndarray]:
     try:
         content = io.BytesIO(read_bytes(path))
         with zipfile.ZipFile(content) as entries:
-            check_size(path, size=sum(entry.file_size for entry in entries.infolist()))
+            check_size(path, largest, sum(entry.file_size for entry in entries.infolist()))
         content.seek(0)
         with np.load(content, allow_pickle=False) as archive:
             for field in archive.files:

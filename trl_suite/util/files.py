@@ -8,10 +8,11 @@ import io
 import json
 import os
 import pathlib
+import re
 import secrets
 import stat
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TextIO
 
 from trl_suite.util import errors
 from trl_suite.util.libraries import optional
@@ -174,6 +175,12 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
         part.unlink(missing_ok=True)
 
 
+def write_text(text: str, path: pathlib.Path) -> None:
+    """Writes a text file in UTF-8; see `replacing`."""
+    with replacing(path) as part:
+        part.write_text(text, encoding='utf-8')
+
+
 def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
     """Returns a temporary name; its suffix is in lower case, as libraries that write files need it."""
     # Processes on other machines or in other containers may have the same number.
@@ -199,8 +206,7 @@ def replace_between(path: pathlib.Path, name: str, program: str, text: str) -> N
     """Replaces the lines between the marks in a page, see `between`."""
     with errors.naming(path):
         new = between(path.read_text(encoding='utf-8'), name, program, text)
-    with replacing(path) as part:
-        part.write_text(new, encoding='utf-8')
+    write_text(new, path)
 
 
 @contextlib.contextmanager
@@ -215,17 +221,16 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
 
     Raises:
       RuntimeError: another process has the lock; the message has its number.
-      OSError: the file cannot be written.
+      OSError: the file cannot be written, or is a link, or no lock file.
     """
     if fcntl is None:
         yield
         return
     while True:
-        with path.open('a+') as file:
+        with _opened_lock(path) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                file.seek(0)
                 raise RuntimeError(f'process {file.read().strip() or "?"} {what}') from None
             except OSError:
                 pass  # the file system has no locks
@@ -235,7 +240,10 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
                 same = False
             if not same:
                 continue  # the process that had the lock has just removed this file
-            file.truncate(0)
+            if not re.fullmatch(r'\d*\n?', file.read(100)):
+                raise FileExistsError(f'{path}: is no lock file; move it away')
+            file.seek(0)
+            file.truncate()
             file.write(f'{os.getpid()}\n')
             file.flush()
             try:
@@ -245,8 +253,16 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
             return
 
 
+def _opened_lock(path: pathlib.Path) -> TextIO:
+    """Opens a lock file, or creates it; does not follow links, or wait for a pipe."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    number = os.open(path, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise FileExistsError(f'{path}: is no lock file; move it away')
+    return os.fdopen(number, 'r+', encoding='utf-8', errors='replace')
+
+
 def write_json(content: Any, path: pathlib.Path, indent: int | None = 1) -> None:
     """Writes a .json file, in one line if `indent` is None."""
-    with replacing(path) as part:
-        text = json.dumps(content, indent=indent, allow_nan=False)
-        part.write_text(f'{text}\n', encoding='utf-8')
+    write_text(json.dumps(content, indent=indent, allow_nan=False) + '\n', path)

@@ -91,6 +91,7 @@ class SpatialFootstepsConfig(MirroredConfig):
         'time after a push or a sharp turn in which max_landing_error does not end the episode',
         unit='s',
         at_least=0,
+        at_most=1000,
     )
     footstep_scale: float | Sequence[float] = option(
         1.0, f'{FOOTSTEP_SCALE}; with several values, the term is the mean over them', at_least=0

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from trl_suite.tasks.task import Task
 
 Function = Callable[[Any], np.ndarray]
+LARGEST = 1e30  # number that a custom function may return
 
 
 class Additions(Component):
@@ -139,15 +140,17 @@ class Additions(Component):
         if fresh:
             return
         for k, (name, (weight, function)) in enumerate(self._rewards.items()):
-            value = self._ask('reward', name, function, 1)[env_ids, 0]
-            self._terms[env_ids, k] = np.where(failed, 0.0, weight * value)
+            value = self._ask('reward', name, function, 1, weight)[env_ids, 0]
+            self._terms[env_ids, k] = np.where(failed, 0.0, value)
             out.reward[env_ids] += self._terms[env_ids, k]
         for name, function in self._failures.items():
             failed = failed | (self._ask('failure', name, function, 1)[env_ids, 0] != 0)
         out.failed[env_ids], out.fell[env_ids] = failed, failed & ~out.diverged[env_ids]
 
-    def _ask(self, kind: str, name: str, function: Function, size: int) -> np.ndarray:
-        """Returns the checked value of a custom function, (n, size).
+    def _ask(
+        self, kind: str, name: str, function: Function, size: int, weight: float = 1.0
+    ) -> np.ndarray:
+        """Returns the checked value of a custom function, times a weight, (n, size).
 
         It must be finite, except in simulations that have diverged, where it becomes 0.
         """
@@ -160,10 +163,14 @@ class Additions(Component):
         if value.shape != (n, size):
             expected = f'({n},)' if kind != 'observation' else f'({n}, {size})'
             raise ValueError(f'{kind} {name!r} has shape {value.shape}; expected {expected}')
-        finite = np.isfinite(value).all(1)
+        with np.errstate(over='ignore'):
+            value = weight * value
+        finite = (np.abs(value) <= LARGEST).all(1)  # also as float32, and in sums
         if not finite.all():
             if not (finite | diverged).all():
-                raise ValueError(f'{kind} {name!r} is not finite: {value[~finite][0]}')
+                raise ValueError(
+                    f'{kind} {name!r} is {value[~finite][0]}; expected finite numbers up to {LARGEST:g}'
+                )
             value = np.where(finite[:, None], value, 0.0)
         return value
 

@@ -26,6 +26,7 @@ STRETCH = 20.0  # m; nominal length generated at once; slopes restart in every s
 KEPT = 50.0  # m; ground farther from the latest query is forgotten
 PAD_END = 1.0  # m; end of the flat start
 INTENDED_CENTRE = -1.0  # m
+HIGHEST = 1e6  # m; of ground from a function
 _STRETCH, _KEPT, _PAD_END = (cells(length) for length in (STRETCH, KEPT, PAD_END))
 _NOWHERE = 2**62  # number of no mark
 _UNUSED = np.random.default_rng(0)  # for level ground, which draws nothing
@@ -243,11 +244,12 @@ class PlanarGround:
                 f'the function of terrain {self.type!r} must return heights of shape {x.shape}, as its '
                 f'argument has; it returned an array of shape {heights.shape}'
             )
-        if not np.isfinite(heights).all():
-            wrong = np.flatnonzero(~np.isfinite(heights))[0]
+        usable = np.abs(heights) <= HIGHEST
+        if not usable.all():
+            wrong = np.flatnonzero(~usable)[0]
             raise ValueError(
                 f'the function of terrain {self.type!r} returned {heights[wrong]} at x = '
-                f'{x[wrong]:g} m; expected finite heights'
+                f'{x[wrong]:g} m; expected finite heights up to {HIGHEST:g} m'
             )
         return heights
 
