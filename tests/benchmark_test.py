@@ -17,6 +17,7 @@ from programs import CommandTest
 from trl_suite import benchmark, evaluation, policies, runs, suite
 from trl_suite.benchmark import core, report
 from trl_suite.runs import results, running
+from trl_suite.runs.course import Course
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 
@@ -131,7 +132,7 @@ def result_of(learner, id_, seed, score, **changes):
     low, high = benchmark.ends(id_)
     curve = [[low + (high - low) * score * (part + 1) / 20] for part in range(20)]
     return {'learner': learner, 'environment': id_, 'seed': seed, 'budget': 200, 'episodes': 32,
-            'scores': curve, **changes}  # fmt: skip
+            'scores': curve, 'metrics': {}, **changes}  # fmt: skip
 
 
 class ReportTest(parameterized.TestCase):
@@ -210,6 +211,13 @@ class ReportTest(parameterized.TestCase):
         ):  # fmt: skip
             with self.assertRaisesRegex(ValueError, message):
                 report.report([first, *others])
+        with self.assertRaisesRegex(ValueError, "unknown environment of the benchmark 'mine'"):
+            benchmark.run(Course('mine', (ID,)), Shipped(benchmark.get(ID), 0))
+        unfinished = {key: value for key, value in first.items() if key != 'metrics'}
+        with self.assertRaisesRegex(ValueError, 'm:A in PD_Biped2D.* with seed 0 has not ended'):
+            report.report([unfinished])
+        with self.assertRaisesRegex(ValueError, 'no results of runs that have ended'):
+            report.report([])
 
 
 class ReportCommandTest(CommandTest):
@@ -230,6 +238,11 @@ class ReportCommandTest(CommandTest):
         self.assert_refused(
             'Nothin: there is no such file; did you mean', 'benchmark', 'check', 'Nothin'
         )
+        state = folder / 'b.stage3'
+        state.mkdir()
+        for path in (state / 'own.json', folder / '.a.json.1-2.part.json'):
+            path.write_text('{')  # of the learner, and of a killed process
+        self.assertIn('a.json: ', self.output('benchmark', 'check', 'Nothing'))
         self.assert_refused('empty: has no results', 'benchmark', 'report', 'empty')
         self.assert_refused(
             "unknown environment of the benchmark 'PD_Gap'",

@@ -84,4 +84,6 @@ class LevelsTest(parameterized.TestCase):
             *((lambda n=n: environment.reset(n), f'level is .*{n}.*from 3 to 4') for n in (2, 5, 3.5, 'three')),
             (lambda: suite.make(id_).reset(0), needs),
             (lambda: several.reset(level=[3, 3, 3]), '3 levels for 2 simulations'),
+            *((lambda n=n: several.task.choose_level(n, 3), 'env_ids is .*; expected whole numbers from 0 to 1')
+              for n in ([2], [-1], ['a'])),
         )  # fmt: skip

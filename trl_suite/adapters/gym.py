@@ -110,7 +110,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
             arguments.check_seed('seed', seed)
             seed = int(seed)
         if level is not None:
-            self.environment.task.choose_level([0], [level])
+            self.environment.task.choose_level([0], level)
         if seed is not None:  # after all checks
             self.environment.random_state.seed(seed)
         super().reset(seed=seed)

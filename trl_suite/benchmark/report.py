@@ -48,17 +48,24 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
         than one of B in the same environment.
 
     Raises:
-      ValueError: results of several budgets or lengths of tests, a run that is there twice, or
+      ValueError: no results, one of a run that has not ended, results of several budgets or lengths of tests, a run that is there twice, or
         learners without a common environment or seed.
     """
     found: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
     for result in results:
+        if 'metrics' not in result:
+            raise ValueError(
+                f'the run of {result["learner"]} in {result["environment"]} with seed {result["seed"]} has '
+                'not ended'
+            )
         runs = found.setdefault(result['learner'], {})
         key = result['environment'], result['seed']
         if key in runs:
             raise ValueError(f'two results of {result["learner"]} in {key[0]} with seed {key[1]}')
         runs[key] = result
     everything = [result for runs in found.values() for result in runs.values()]
+    if not everything:
+        raise ValueError('no results of runs that have ended')
     for name in ('budget', 'episodes'):
         values = {result[name]: result for result in everything}
         if len(values) != 1:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import inspect
 import os
 import pathlib
+import re
 import sys
 import traceback
 from collections.abc import Iterator
@@ -84,10 +86,16 @@ def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
     paths = []
     for entry in entries:
         found = sorted(entry.rglob('*.json')) if entry.is_dir() else [files.existing(entry)]
+        found = [path for path in found if not _is_state(path.relative_to(entry))]
         if not found:
             raise ValueError(f'{entry}: has no results; expected files ENVIRONMENT_sSEED.json')
         paths += found
     return paths
+
+
+def _is_state(path: pathlib.Path) -> bool:
+    """Returns whether a file is part of a learner's state, or left by a run that was killed."""
+    return any(re.search(r'^\.|\.stage\d+$', part) for part in path.parts)
 
 
 def _read(benchmark: Any, entries: list[pathlib.Path]) -> Iterator[tuple[pathlib.Path, Any]]:
@@ -136,7 +144,7 @@ def _run(arguments: argparse.Namespace) -> None:
         path = folder / f'{course.name}_s{arguments.seed}.json'
         with _shown(arguments.learner):
             result = benchmark.run(
-                course, kind(course, arguments.seed), budget, path, arguments.episodes,
+                course, _made(kind, course, arguments), budget, path, arguments.episodes,
                 arguments.seed, arguments.threads, progress=True,
             )  # fmt: skip
         print(f'{path}: score {result["metrics"]["score"]:.3f}', flush=True)
@@ -157,7 +165,7 @@ def _run_sequence(arguments: argparse.Namespace) -> None:
     _warn(sequences.BENCHMARK, sequence, budget, arguments)
     with _shown(arguments.learner):
         result = sequences.run(
-            sequence, kind(sequence, arguments.seed), budget, arguments.output, arguments.episodes,
+            sequence, _made(kind, sequence, arguments), budget, arguments.output, arguments.episodes,
             arguments.seed, arguments.threads, progress=True, stages=arguments.stages,
         )  # fmt: skip
     for id, row in zip(sequence.ids, result['scores'], strict=False):
@@ -202,7 +210,7 @@ def _report(arguments: argparse.Namespace) -> None:
 
 def _verify(arguments: argparse.Namespace) -> None:
     benchmark = engine.load('trl_suite.benchmark')
-    for path in _results(arguments.entries):
+    for path, _ in _read(benchmark, arguments.entries):
         result, allowed = benchmark.verify(path, arguments.threads)
         how = 'bit for bit' if not allowed else f'within {allowed}'
         mujoco, cpu = (result.get(name, 'unknown') for name in ('mujoco', 'cpu'))
@@ -212,6 +220,18 @@ def _verify(arguments: argparse.Namespace) -> None:
                 f'{path}: verified {how} (made with MuJoCo {mujoco} on {cpu}), {score}'
             )
         )
+
+
+def _made(kind: Any, course: Any, arguments: argparse.Namespace) -> Any:
+    """Makes a learner."""
+    try:
+        inspect.signature(kind).bind(course, arguments.seed)
+    except TypeError as error:
+        raise ValueError(
+            f'--learner is {arguments.learner!r}; expected a class that is made as CLASS(course, seed): '
+            f'{error}'
+        ) from None
+    return kind(course, arguments.seed)
 
 
 def _budget(text: str, budgets: dict[str, int]) -> int:

@@ -315,7 +315,7 @@ class Environment(composer.Environment):
         """
         with self.core as core:
             if level is not None:
-                core.task.choose_level([0], [level])
+                core.task.choose_level([0], level)
             core.ended[0] = True  # until the reset has succeeded
             self.at_limit = False
             self._show_reward(0.0)

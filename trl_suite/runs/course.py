@@ -101,7 +101,7 @@ def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
       count: number of seeds.
       seed: seed from which these seeds are drawn, e.g. (run, stage).
     """
-    checked('count', count, int, at_least=0, at_most=2**32)
+    count = checked('count', count, int, at_least=0, at_most=2**32)
     drawn = np.random.SeedSequence(seed).generate_state(count, np.uint32)
     return (drawn % FIRST_TEST_SEED).tolist()
 

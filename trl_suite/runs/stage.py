@@ -81,7 +81,7 @@ class Stage:
         errors.check_known('environment of the run', self.ids, id)
         if 'seed' in options:
             raise ValueError('seed: expected none, since the stage draws it from that of the run')
-        checked('num_envs', num_envs, int, at_least=1, at_most=MOST_ENVS)
+        num_envs = checked('num_envs', num_envs, int, at_least=1, at_most=MOST_ENVS)
         seeds = train_seeds(num_envs, (self.seed, self.number, next(self._made)))
         options = {'num_threads': self._num_threads, **options}
         return _Counted(

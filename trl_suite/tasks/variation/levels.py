@@ -72,11 +72,15 @@ class Levels(Component):
         """Sets the level of the next episode of some simulations: one for all, or one for each.
 
         Raises:
-          ValueError: a level that is not among those of the environment.
+          ValueError: a level that is not among those of the environment, or simulations that it
+            does not have.
         """
+        ids, n = np.asarray(env_ids), len(self.state.chosen)
+        if ids.dtype.kind not in 'iu' or ((ids < 0) | (ids >= n)).any():
+            raise ValueError(f'env_ids is {env_ids!r}; expected whole numbers from 0 to {n - 1}')
         last = self.first + self.count - 1
         kind = Sequence[int] if np.ndim(level) else int
         given = np.asarray(checked('level', level, kind, at_least=self.first, at_most=last))
-        if given.ndim and given.shape != np.shape(env_ids):
-            raise ValueError(f'{len(given)} levels for {np.size(env_ids)} simulations')
-        self.state.chosen[env_ids] = given
+        if given.ndim and given.shape != ids.shape:
+            raise ValueError(f'{len(given)} levels for {ids.size} simulations')
+        self.state.chosen[ids] = given
