@@ -107,10 +107,9 @@ setup(
         'cluster': [f'ray{RAY}', 'fsspec'],
         'shimmy': ['shimmy[dm-control]>=2.0,<3'],
         'clips': [BVH],
-        'train': [TORCH, 'scipy'],
+        'train': [TORCH],
         'tune': ['cma'],
         'test': [
-            'absl-py',
             'pytest',
             'pytest-xdist',
             'build',
@@ -121,7 +120,6 @@ setup(
             'matplotlib',
             'pycollada',
             'playwright>=1.50',  # drives Chromium, which the tests look for on the system
-            'scipy',
             BVH,
             TORCH,
             VISER,

@@ -20,7 +20,8 @@ from trl_suite import actuation, characters, evaluation, policies, suite
 from trl_suite.actuation import realism, series, strength_curves
 from trl_suite.describe.options import table_of
 from trl_suite.engine import motors
-from trl_suite.util import files, tables
+from trl_suite.util import errors, files, tables
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -58,10 +59,10 @@ STRENGTHS = {  # three strengths of each option
 ENVS, ROUNDS, STEPS = 16, 9, 8
 
 
-def fits(spec: object, options: dict[str, object]) -> bool:
+def fits(id_: str, options: dict[str, object]) -> bool:
     """Returns whether an environment can have these options."""
     try:
-        suite.make(spec.id, task_kwargs={'actuators': options})  # type: ignore[attr-defined]
+        suite.make(id_, task_kwargs={'actuators': options})
     except ValueError:
         return False
     return True
@@ -91,15 +92,14 @@ def cpu(environments: VectorEnvironment, steps: int) -> float:
 def costs(titles: list[str]) -> None:
     """Measures the time of each option relative to ideal actuators."""
     result = files.read_json(RESULTS).get('costs', {}) if RESULTS.exists() else {}
+    errors.check_known('title', COST_IDS, *titles)
     for title in titles or COST_IDS:
         id_ = COST_IDS[title]
         made = {}
         for name, options in {'ideal': {}, **OPTIONS}.items():
             if 'gait' in title and 'delay' in options:
                 options = {**options, 'delay': realism.GAIT_DELAY}
-            own = {
-                key: value for key, value in options.items() if fits(suite.find(id_), {key: value})
-            }
+            own = {key: value for key, value in options.items() if fits(id_, {key: value})}
             if own or not options:
                 made[name] = VectorEnvironment(id_, ENVS, 1, seed=0, task_kwargs={'actuators': own})
                 made[name].reset()
@@ -212,7 +212,7 @@ def series_panel(axes: object, name: str, **options: object) -> None:
     model, data = physics.model.ptr, physics.data.ptr
     joint, motor = model.joint(f'right_hip_{name}'), model.joint('right_hip')
     limit, found = figure.torque_limits[0], []
-    for torque in limit * 0.1 * np.concatenate([np.sin(np.linspace(0, 2.5 * np.pi, 2500))]):
+    for torque in limit * 0.1 * np.sin(np.linspace(0, 2.5 * np.pi, 2500)):
         data.qfrc_applied[:] = 0
         data.qfrc_applied[[joint.dofadr[0], motor.dofadr[0]]] = torque  # on the thigh
         physics.step()
@@ -312,6 +312,7 @@ def page() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('what', choices=('costs', 'effects', 'plots', 'page'))
     parser.add_argument('titles', nargs='*', help='for costs: only these columns')

@@ -28,6 +28,7 @@ from ray import cluster_utils
 
 from trl_suite import evaluation, policies
 from trl_suite.adapters.ray import RayExecutor
+from trl_suite.util.program import begin_script
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'training'))
 import train_all
@@ -216,4 +217,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

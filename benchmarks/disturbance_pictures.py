@@ -9,7 +9,6 @@ shipped policy of each environment.
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 from typing import Any
 
@@ -20,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from trl_suite import policies, rendering, suite
-from trl_suite.util import errors, resources
+from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 
 WALK, GROUND, PUSHED = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-v0'
@@ -128,8 +127,7 @@ def draw_randomized(path: pathlib.Path) -> None:
     for axis in axes.flat[len(ids) :]:
         axis.remove()
     for axis, id_ in zip(axes.flat, ids, strict=False):
-        file = resources.directory('trained') / 'randomized' / f'{id_}.json'
-        entry = json.loads(file.read_text())
+        entry = files.read_json(resources.directory('trained') / 'randomized' / f'{id_}.json')
         curve = [[point['samples'], point['normalized_return']] for point in entry['curve']]
         samples, returns = np.transpose(curve)
         axis.plot(samples / 1e6, returns, '.-')

@@ -1,6 +1,6 @@
 """Measures what worlds that vary, pushes and sensors cost.
 
-    python benchmarks/disturbances.py [IDS ...] [--num-envs 64] [--steps 50] [--repeats 5]
+    python benchmarks/disturbances.py [IDS ...] [--num-envs 64] [--steps 8] [--repeats 8]
         [--json docs/data/disturbances.json]
 
 CPU time per step and per reset of one simulation, in microseconds, on one thread: the smallest of

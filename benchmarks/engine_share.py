@@ -23,8 +23,8 @@ import numpy as np
 import tqdm
 
 from trl_suite import suite
-from trl_suite.engine import native
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
@@ -137,7 +137,6 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=5.0, help='of each measurement')
     parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
     arguments = parser.parse_args()
-    assert native.NAMES  # the functions that are timed
     figures: dict[str, Any] = {}
     cases = [(id_, n) for id_ in arguments.ids for n in arguments.num_envs]
     for id_, n in tqdm.tqdm(cases):
@@ -149,4 +148,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

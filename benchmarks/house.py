@@ -17,6 +17,7 @@ import sys
 import tempfile
 
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 IDS = {
@@ -79,4 +80,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

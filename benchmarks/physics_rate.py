@@ -29,6 +29,7 @@ import numpy as np
 from trl_suite import suite
 from trl_suite.tasks.common.control import SUBSTEPS as DEFAULT
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 
 RATES = (100, 40, 20, 10, 8, 5, 4)  # physics steps per control step of 1/30 s, finest first
 CONTROL_RATE = 30  # Hz
@@ -511,4 +512,5 @@ def main():
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

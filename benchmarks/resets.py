@@ -32,6 +32,7 @@ from trl_suite.engine import World
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.terrain.spatial.layout import Layout
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
@@ -121,4 +122,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -218,10 +218,8 @@ def main() -> None:
     )
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
-    for id_ in arguments.ids:
-        catalogue.find(id_)
     found = run(
-        arguments.ids, arguments.episodes, arguments.seeds, arguments.threads, arguments.step_limit,
+        [catalogue.find(name).id for name in arguments.ids], arguments.episodes, arguments.seeds, arguments.threads, arguments.step_limit,
         arguments.json,
     )  # fmt: skip
     text = table(found)

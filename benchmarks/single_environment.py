@@ -24,6 +24,7 @@ from trl_suite import suite  # isort: skip  (before dm_control: it selects the r
 from dm_control import suite as dm_suite
 
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 BLOCK = 200  # control steps
@@ -110,4 +111,5 @@ def main():
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -27,6 +27,7 @@ import resource
 from trl_suite.cli import bench
 from trl_suite.cli.bench import actions, rate, raw
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 
 IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
@@ -191,4 +192,5 @@ def main():
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

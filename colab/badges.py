@@ -56,12 +56,10 @@ def main() -> None:
         parser.error(f'{arguments.repository!r} is no repository; expected OWNER/NAME')
     for path in sorted(FOLDER.glob('*.ipynb')):
         text = mark(path.read_text('utf-8'), arguments.repository, path.stem, arguments.released)
-        with files.replacing(path) as part:
-            part.write_text(text, encoding='utf-8')
+        files.write_text(text, path)
     path = FOLDER / 'README.md'
     text = link(path.read_text('utf-8'), arguments.repository)
-    with files.replacing(path) as part:
-        part.write_text(text, encoding='utf-8')
+    files.write_text(text, path)
 
 
 if __name__ == '__main__':

@@ -214,8 +214,7 @@ def main() -> None:
         sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found))
     files.write_json(found, stored)
     pictures(found, others)
-    with files.replacing(PAGE) as part:
-        part.write_text(new, encoding='utf-8')
+    files.write_text(new, PAGE)
 
 
 def rounded(found: Any) -> Any:

@@ -161,12 +161,11 @@ def render(app: Any) -> None:
     except RuntimeError as error:
         print(f'The site has fewer pictures: {error}', file=sys.stderr)
         return
-    for path, error in failed.items():
-        from sphinx.errors import (
-            ConfigError,
-        )  # the tests, which read this file, work without Sphinx
+    if failed:
+        # The tests, which read this file, work without Sphinx.
+        from sphinx.errors import ConfigError
 
-        raise ConfigError(f'{path}: {error}') from error
+        raise ConfigError('\n'.join(f'{path}: {error}' for path, error in failed.items()))
 
 
 def setup(app: Any) -> None:

@@ -15,7 +15,6 @@ import functools
 import hashlib
 import io
 import itertools
-import json
 import pathlib
 import tempfile
 from collections.abc import Callable, Iterator
@@ -81,13 +80,11 @@ class Item:
       draw: function that returns the picture, (h, w, 3) uint8, or a sequence of pictures if it is
         animated.
       source: digest of the policy or the record that it shows; '' if it shows neither.
-      largest: largest number of bytes.
     """
 
     path: str
     draw: Callable[[], Any] = dataclasses.field(repr=False)
     source: str = ''
-    largest: int = LARGEST
 
 
 def items() -> Iterator[Item]:
@@ -151,7 +148,7 @@ def curve_path(id: str) -> str:
 def record(name: str) -> dict[str, Any]:
     """Returns a file of trained/ (see its README.md), such as the record of an environment; {} if none."""
     path = resources.directory('trained') / f'{name}.json'
-    return json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}
+    return files.read_json(path) if path.exists() else {}
 
 
 def shipped_run(found: dict[str, Any]) -> dict[str, Any]:
@@ -218,7 +215,7 @@ def make(
             bar.set_description(path.name)
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                save(item.draw(), path, item.source, item.largest)
+                save(item.draw(), path, item.source)
                 written.append(path)
             except (ValueError, OSError) as error:
                 failed[item.path] = error
@@ -276,15 +273,14 @@ def film_strip(id: str) -> np.ndarray:
     return rendering.film_strip(images, columns=COLUMNS)
 
 
-def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarray:
+def moment(id: str, time: float) -> np.ndarray:
     """Renders one frame of such an episode.
 
     Args:
       id: id of the environment.
       time: since the start of the episode, s.
-      size: height and width, pixels.
     """
-    return _draw(id, {round(time / FRAME)}, size)[-1]
+    return _draw(id, {round(time / FRAME)}, STRIP_SIZE)[-1]
 
 
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
@@ -355,14 +351,15 @@ def curve(id: str) -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
+def save(image: Any, path: files.Path, source: str = '') -> None:
     """Writes a small picture: a .png with a palette, or a .jpg of the best quality that fits.
+
+    A .jpg of the lowest quality may have more than `LARGEST` bytes.
 
     Args:
       image: (h, w, 3) uint8; for an animated .webp a sequence of pictures.
       path: file to write.
       source: digest to store in the file, see `Item`.
-      largest: number of bytes that a .jpg should not exceed; the lowest quality may exceed it.
     """
     from PIL import Image, PngImagePlugin
 
@@ -379,7 +376,7 @@ def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST)
         for quality in QUALITIES:
             content = io.BytesIO()
             picture.save(content, 'jpeg', quality=quality, optimize=True, comment=source)
-            if content.tell() <= largest:
+            if content.tell() <= LARGEST:
                 break
     with files.replacing(path) as part:
         part.write_bytes(content.getvalue())

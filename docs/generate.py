@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
 import pathlib
 import statistics
 import sys
@@ -421,8 +420,7 @@ PROJECTED = '1024 simulations, 2 threads'
 
 
 def speeds() -> dict[str, Any]:
-    path = DOCS / 'data' / 'vector_environment.json'
-    return json.loads(path.read_text(encoding='utf-8'))
+    return files.read_json(DOCS / 'data' / 'vector_environment.json')
 
 
 def option_tables() -> dict[str, str]:
@@ -447,10 +445,7 @@ def filled(path: str, tables: dict[str, str]) -> str:
 
 def cost() -> str:
     """Returns what worlds and sensors cost, from docs/data/disturbances.json."""
-    path = DOCS / 'data' / 'disturbances.json'
-    if not path.exists():
-        return ''
-    found = json.loads(path.read_text())
+    found = files.read_json(DOCS / 'data' / 'disturbances.json')
     ids = list(found)
     cells = [
         (name, *(f'{found[id_][name][what]:.0f}' for id_ in ids for what in ('step', 'reset')))
@@ -548,8 +543,7 @@ def stale(found: dict[str, str]) -> Iterator[str]:
 def write(path: str, text: str) -> None:
     file = DOCS / path
     file.parent.mkdir(exist_ok=True)
-    with files.replacing(file) as part:
-        part.write_text(text, encoding='utf-8')
+    files.write_text(text, file)
 
 
 def write_site() -> int:

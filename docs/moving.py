@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from dm_control.mujoco import engine
+from scipy import ndimage
 
 from trl_suite import rendering, suite
 from trl_suite.environments import named_policies
@@ -33,7 +34,7 @@ SCENES = {
     'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 11.0),
 }
 # Camera angles in order of preference: azimuth from the heading, and elevation, degrees.
-PLANAR_VIEWS = ((74.0, -12.0),)
+PLANAR_VIEW = (74.0, -12.0)
 SPATIAL_VIEWS = (
     (50.0, -20.0), (-50.0, -20.0), (130.0, -20.0), (-130.0, -20.0), (20.0, -25.0), (50.0, -42.0),
     (-50.0, -42.0), (0.0, -50.0), (90.0, -65.0),
@@ -195,15 +196,10 @@ def _extent(environment: Environment) -> np.ndarray:
 
 def _smooth(path: np.ndarray) -> np.ndarray:
     """Returns a path smoothed by Gaussian weights, (k, 3) m."""
-    offsets = np.arange(-3 * SMOOTH, 3 * SMOOTH + 1)
-    weights = np.exp(-0.5 * (offsets / SMOOTH) ** 2)
-    weights /= weights.sum()
-    # The path is extended beyond its ends with its mean velocity.
-    pace = (path[-1] - path[0]) / max(1, len(path) - 1)
-    before = path[0] + offsets[offsets < 0, None] * pace
-    after = path[-1] + offsets[offsets > 0, None] * pace
-    longer = np.concatenate([before, path, after])
-    return np.stack([np.convolve(column, weights, 'valid') for column in longer.T], axis=1)
+    # Beyond its ends the path goes on with its mean velocity.
+    line = np.linspace(path[0], path[-1], len(path))
+    offset = path - line
+    return line + ndimage.gaussian_filter1d(offset, SMOOTH, axis=0, mode='constant', truncate=3)
 
 
 def _free_view(
@@ -211,7 +207,7 @@ def _free_view(
 ) -> tuple[float, float]:
     """Returns azimuth and elevation, degrees, from which obstacles hide little of the character."""
     if not environment.task.arena.terrain.spatial:
-        return PLANAR_VIEWS[0]
+        return PLANAR_VIEW
     travelled = shot.root[-1] - shot.root[0]
     heading = np.rad2deg(np.arctan2(travelled[1], travelled[0]))
     views = [(heading + azimuth, elevation) for azimuth, elevation in SPATIAL_VIEWS]

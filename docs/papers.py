@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import pathlib
 from collections.abc import Iterable
 from typing import Any
@@ -12,6 +11,7 @@ import gallery
 import numpy as np
 
 from trl_suite import describe
+from trl_suite.util import files
 
 RUNS = pathlib.Path(__file__).resolve().parent / 'continual'
 # Action spaces (2017), supplement, table 4: normalised reward, mean ± standard deviation over 32
@@ -132,7 +132,7 @@ def plaid(kind: int) -> str:
         rows.append((learner, 'published', *published[kind].split()))
         for character in ('biped', 'dog', 'raptor') if name else ():
             paths = sorted((RUNS / f'plaid_{character}').glob(f'{name}_s*.json'))
-            scores = np.mean([json.loads(path.read_text())['scores'] for path in paths], axis=0)
+            scores = np.mean([files.read_json(path)['scores'] for path in paths], axis=0)
             final, own = scores[-1], scores.diagonal()  # after all stages, after its own stage
             values = final / own - 1 if kind else final
             rows.append(('', f'our {character}', *map(figure, (*values, values.mean()))))

@@ -30,10 +30,10 @@ def main(arguments=None):
     clip.save('clip.npz')
 
     environment = suite.build(chosen.character, clip=clip, task_kwargs={'random': 1})
-    frames = rendering.frames(
-        environment, lambda _: environment.task.clip_action(0), 30, ghost=True
-    )
     if chosen.strip:
+        frames = rendering.frames(
+            environment, lambda _: environment.task.clip_action(0), 30, ghost=True
+        )
         rendering.film_strip(frames, chosen.strip)
 
 

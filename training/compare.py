@@ -4,7 +4,8 @@
     python training/compare.py changes --seeds 1 2 3 --json docs/data/gait_changes.json
     python training/compare.py hierarchy --seeds 1 2 3 --json docs/data/hierarchy.json \
         --page docs/reports/deeploco.md --picture docs/pictures/hierarchy.png
-    python training/compare.py limits --seeds 1 2 3 --samples 5e5 --page docs/reports/robustness.md
+    python training/compare.py limits --seeds 1 2 3 --samples 5e5 \
+        --json docs/data/limits.json --page docs/reports/robustness.md
 
 `actions`: base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
 `changes`: the selection of base actions by a shipped policy, trained on with PPO, alone and with changes.
@@ -150,7 +151,7 @@ def distance_panels(names: dict[str, str], results: Results) -> dict[str, dict[s
 
 def of_gaits(cycles: float, id_: str, names: dict[str, str], job: Callable[..., Any]) -> Comparison:
     """Returns a comparison by the distance to the first fall in an environment."""
-    table, panels = (functools.partial(of, names) for of in (distance_table, distance_panels))
+    table, panels = (functools.partial(f, names) for f in (distance_table, distance_panels))
     return Comparison(
         cycles, tuple(names), job, functools.partial(table, id_), panels, 'cycles, thousand'
     )

@@ -212,8 +212,7 @@ def main() -> None:
         if runs := load(folder):
             curves_picture(runs, FOLDER / f'{folder.name}_curves.svg')
             scores_picture(runs, FOLDER / f'{folder.name}_scores.svg')
-    with files.replacing(path) as part:
-        part.write_text(new, encoding='utf-8')
+    files.write_text(new, path)
 
 
 if __name__ == '__main__':

@@ -166,15 +166,16 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=SECONDS)
     arguments = parser.parse_args()
+    id_ = suite.find(arguments.id).id
     if arguments.policy and arguments.variant:
         parser.error('give either a file or --variant, not both')
     policy = (
         policies.load(arguments.policy)
         if arguments.policy
-        else suite.reference_policy(arguments.id, arguments.variant)
+        else suite.reference_policy(id_, arguments.variant)
     )
     for name in arguments.filter:
-        row, options = under(arguments.id, name)
+        row, options = under(id_, name)
         result = run(row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options)
         print(
             f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '
@@ -185,7 +186,7 @@ def main() -> None:
             flush=True,
         )
         if not arguments.policy and not arguments.variant:
-            runs.add('footsteps.json', arguments.id, name, result)
+            runs.add('footsteps.json', id_, name, result)
 
 
 if __name__ == '__main__':

@@ -51,9 +51,9 @@ def search(
     parameters = copies.task.gait.parameters
     base = parameters.action(parameters.base_actions)
     std = np.resize(stds, copies.num_envs)[:, None]
-    past, farthest, begin = [[start]], 0.0, None
+    past, farthest, begin, cycles = [[start]], 0.0, None, 0
     with tqdm.tqdm(total=budget, unit='cycle') as bar:
-        while farthest < metres and bar.n < budget:
+        while farthest < metres and cycles < budget:
             for i in range(copies.num_envs):
                 copies.set_state(past[-1][i % len(past[-1])], [i])
             before = position(copies)
@@ -61,6 +61,7 @@ def search(
             action = base[rng.integers(len(base), size=copies.num_envs)]
             action = np.clip(action + std * rng.standard_normal(action.shape), -1, 1)
             ended = copies.step(action).terminated
+            cycles += copies.num_envs
             bar.update(copies.num_envs)
             reached = np.where(ended | (position(copies) < before), -np.inf, position(copies))
             best = np.argsort(-reached)[:BEAM]
@@ -70,7 +71,7 @@ def search(
                 farthest = max(farthest, float(reached[best[0]] - begin))
             else:
                 del past[max(1, len(past) - rng.geometric(1 / BACK)) :]
-    return farthest, bar.n
+    return farthest, cycles
 
 
 def main() -> None:

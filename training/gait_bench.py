@@ -180,7 +180,7 @@ def path_of(character: str) -> pathlib.Path:
 
 def stored(character: str) -> dict[str, Any]:
     """Returns the parameters of a character's gait."""
-    return json.loads(path_of(character).read_text())
+    return files.read_json(path_of(character))
 
 
 def write(character: str, data: dict[str, Any]) -> pathlib.Path:
@@ -214,6 +214,5 @@ def write(character: str, data: dict[str, Any]) -> pathlib.Path:
         parts.append(f'  {json.dumps(name)}: {text}')
     text = '{\n' + ',\n'.join(parts) + '\n}\n'
     assert json.loads(text) == data
-    with files.replacing(path_of(character)) as part:
-        part.write_text(text)
+    files.write_text(text, path_of(character))
     return path_of(character)

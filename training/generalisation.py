@@ -1,6 +1,6 @@
 """Measures how a policy that was trained on few levels does on others, as Procgen does (Cobbe et al. 2020).
 
-    python generalisation.py --output runs  # all, one after the other; continues after a stop
+    python training/generalisation.py --output runs  # all, one after the other; continues after a stop
 
 Writes the scores on the levels of training and on others to docs/benchmark/levels.json.
 """
@@ -50,6 +50,7 @@ def main():
     parser.add_argument('--output', type=pathlib.Path, required=True, help='folder of the runs')
     parser.add_argument('--budget', type=float, default=1e6, help='samples of each run')
     arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
     found = files.read_json(FILE) if FILE.exists() else {}
     for seed in benchmark.SEEDS:
         for id_ in IDS:

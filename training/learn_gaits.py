@@ -1,4 +1,4 @@
-"""Learns with Q-learning to select a base action of a gait in every cycle, in one file, on the CPU.
+"""Learns with Q-learning to select a base action of a gait in every cycle, on the CPU.
 
     python training/learn_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1 --threads 1
     python training/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs

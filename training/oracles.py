@@ -222,6 +222,8 @@ def main() -> None:
         policy = policies.load(arguments.policy) if arguments.policy else policies.reference(id_)
         options = id_, policy, arguments.falls, arguments.tries, arguments.seed
         gait = catalogue.BY_ID[id_].actuation == 'gait'
+        if gait and condition:
+            parser.error(f'--condition is for footstep controllers, not for {id_}')
         found = of_gait(*options) if gait else of_tracking(*options, condition)
         found |= {'falls': arguments.falls, 'seed': arguments.seed, 'policy': policy.id}
         found |= {'samples': policy.info.get('samples')}

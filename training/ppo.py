@@ -27,7 +27,7 @@ import numpy as np
 import runs
 import torch
 import tqdm
-from expert import expert, joint_expert
+from expert import CONTROLLER, DRIBBLING, expert, joint_expert
 from networks import ACTIVATIONS, Maps, Scales, mean_of
 from settings import Settings, settings_for
 from several import LANDING_ERRORS, Several
@@ -45,8 +45,9 @@ TEACHERS: dict[str, Callable[..., Any]] = {
     **named_policies.BASELINES,
     'expert': expert,
     'joint_expert': joint_expert,
-    'nominal': lambda environments: policies.reference('PD_Biped3D_LLC_General_Step-v0'),
+    'nominal': lambda environments: policies.reference(CONTROLLER),
 }
+USED = {'nominal': (CONTROLLER,), 'joint_expert': (CONTROLLER, DRIBBLING)}  # policies of teachers
 _STATE = (  # what a checkpoint holds besides what `learnt` returns
     'begun', 'samples', 'current', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns',
     'steps',

@@ -1,4 +1,4 @@
-"""Improves a policy that selects base actions of a gait, with PPO, in one file, on the CPU.
+"""Improves a policy that selects base actions of a gait, with PPO, on the CPU.
 
     python training/refine_gaits.py FSM_Biped2D_Terrain_Slopes_Mixed-v0 --seed 1 --threads 1
     python training/refine_gaits.py FSM_Goat2D_Terrain_Cliffs-v0 --start FSM_Goat2D_Terrain_Cliffs-v0
@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import pathlib
 import time
 from typing import Any
@@ -44,7 +43,7 @@ from torch.optim import swa_utils
 
 from trl_suite import policies
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import errors
+from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 
 
@@ -412,7 +411,7 @@ def first_policy(
         return learn_gaits.initial_policy(settings.start), []
     first = folder / 'first'
     if (folder / 'checkpoint.pt').exists():  # PPO has begun
-        curve = json.loads((first / 'curve.json').read_text())['curve']
+        curve = files.read_json(first / 'curve.json')['curve']
     else:
         curve = learn_gaits.train(id_, seed, settings.first, first, threads)
     return policies.load(first / 'policy.npz'), curve

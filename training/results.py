@@ -22,6 +22,7 @@ from pages import DOCS, picture, table
 
 from trl_suite import policies
 from trl_suite.registry import catalogue, terrainrl
+from trl_suite.util import files
 from trl_suite.util.program import begin_script
 
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
@@ -369,8 +370,9 @@ def main() -> None:
     entries = load()
     text, path = page(entries), DOCS / 'results.md'
     if arguments.check:
-        sys.exit(0 if path.exists() and path.read_text() == text else f'{path} is out of date')
-    path.write_text(text)
+        old = path.read_text(encoding='utf-8') if path.exists() else ''
+        sys.exit(0 if old == text else f'{path} is out of date')
+    files.write_text(text, path)
     plot(entries)
     print(path)
 

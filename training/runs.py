@@ -17,6 +17,7 @@ import json
 import pathlib
 import platform
 import re
+import shutil
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -86,8 +87,8 @@ def write_curve(
         'id': id_, 'seed': seed, **more, 'settings': dataclasses.asdict(settings),
         'threads': threads, 'curve': curve,
     }  # fmt: skip
-    with files.replacing(folder / 'curve.json') as part:
-        part.write_text(json.dumps(record, indent=1))  # settings may be infinite
+    # Settings may be infinite, which `write_json` refuses.
+    files.write_text(json.dumps(record, indent=1), folder / 'curve.json')
 
 
 def save(state: dict[str, Any], path: pathlib.Path) -> None:
@@ -175,6 +176,13 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
         yield
 
 
+def remove(folder: pathlib.Path) -> None:
+    """Removes the folder of a run, unless another process trains there; see `only_run`."""
+    if folder.exists():
+        with only_run(folder):
+            shutil.rmtree(folder)
+
+
 # Results in `trained/`, or in the folder TRL_SUITE_TRAINED.
 
 
@@ -191,14 +199,13 @@ def place(name: str) -> pathlib.Path:
 def read(name: str) -> dict[str, Any]:
     """Returns the content of a .json file with results, {} if there is none."""
     path = place(name)
-    return json.loads(path.read_text()) if path.exists() else {}
+    return files.read_json(path) if path.exists() else {}
 
 
 def write(name: str, content: Any) -> None:
     """Writes a .json file with results in one line, since they have long lists."""
     place(name).parent.mkdir(parents=True, exist_ok=True)
-    with files.replacing(place(name)) as part:
-        part.write_text(json.dumps(content) + '\n')
+    files.write_text(json.dumps(content) + '\n', place(name))
 
 
 def add(name: str, id_: str, key: str, value: Any) -> None:

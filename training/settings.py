@@ -283,15 +283,14 @@ MORE_STABLY = {
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
 STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
-    **FOOTSTEPS, 'samples': 1e6, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'samples': 1e6, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'stages': ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),),
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
 # Styles: mostly without disturbances, in which a policy that survives has no reason to change.
 STYLED = {
-    **FOOTSTEPS, 'samples': 1.5e6, 'num_envs': 64, 'minibatch': 512, 'averaged': 1e5,
-    'start': 'PD_Biped3D_LLC_General_Step-v0', 'start_std': 0.12, 'value_first': 6e4,
-    'learning_rate': 3e-4, 'last_learning_rate': 3e-5,
+    'samples': 1.5e6, 'averaged': 1e5, 'start': 'PD_Biped3D_LLC_General_Step-v0', 'start_std': 0.12,
+    'value_first': 6e4, 'last_learning_rate': 3e-5,
     'landing_costs': {'landing_error': 8.0, 'heading_error': 2.0},
     'stages': together(
         (
@@ -446,7 +445,7 @@ ON_TRAILS = {
 # longer steps does.
 PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
 PLANAR_STEPS = {
-    'samples': 0.8e6, 'gamma': 0.97, 'start': 'PD_Biped2D_Flat-v0',
+    'gamma': 0.97, 'start': 'PD_Biped2D_Flat-v0',
     'stages': (
         (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
         (0.2, {'footstep_scale': 5.0, 'max_landing_error': 0.3, 'plans': PLANAR_PLANS}),
@@ -457,7 +456,7 @@ PLANAR_STEPS = {
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
 RUN_FAR = {'heading_scale': 2.0, 'max_landing_error': 0.8}
 RUN_STEPS = {
-    **FOOTSTEPS, **RUNS, 'samples': 5e6,
+    **FOOTSTEPS, 'samples': 5e6,
     'stages': (
         (0.0, {'footstep_scale': 2.0, **RUN_FAR}),
         (0.25, {'footstep_scale': 4.0, **RUN_FAR, 'plans': {**RUN_PLANS, 'turn': 0.15}}),
@@ -468,7 +467,7 @@ RUN_STEPS = {
     ),
 }  # fmt: skip
 PLANS = {  # a step is a whole footstep, so there are few samples
-    'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
+    'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'learning_rate': 2e-4,
     'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('goal',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
@@ -592,8 +591,8 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
     # From one kind of obstacle to mixed terrain, and from there to mixed terrain on slopes.
     *(
-        (f'PD_{name}_{to}_Terrain-v0', {'samples': n, 'start': f'PD_{name}_{start}_Terrain-v0'})
-        for name, n in (('Biped2D', 4e6), ('Dog2D', 2e6), ('Raptor2D', 2e6))
+        (f'PD_{name}_{to}_Terrain-v0', {'start': f'PD_{name}_{start}_Terrain-v0'})
+        for name in ('Biped2D', 'Dog2D', 'Raptor2D')
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),

@@ -22,7 +22,7 @@ from typing import Any
 import runs
 import train_all
 
-from trl_suite import evaluation, policies
+from trl_suite import evaluation, policies, suite
 from trl_suite.cli.arguments import positive
 from trl_suite.environments import named_policies
 from trl_suite.util.program import begin_script
@@ -74,7 +74,10 @@ def main() -> None:
     parser.add_argument('--preferences', type=float, nargs='+', default=[0.0])
     parser.add_argument('--threads', type=int, default=1, help='0: all cores')
     arguments = parser.parse_args()
-    for id_ in arguments.ids:
+    of, ids = suite.find(arguments.policy).id, [suite.find(name).id for name in arguments.ids]
+    if of != policies.trained_for(of):
+        parser.error(f'{of} has the policy of {policies.trained_for(of)}; give that id')
+    for id_ in ids:
         options = arguments.episodes, train_all.SEED, arguments.threads
         before, has_policy = stored(id_, arguments.episodes), id_ in policies.available()
         if before is None and has_policy:
@@ -82,7 +85,7 @@ def main() -> None:
         elif before is None:
             before = evaluation.evaluate(id_, named_policies.zero, *options, factory=True)
         preference, policy = preferring(
-            id_, policies.reference(arguments.policy), arguments.preferences, arguments.episodes,
+            id_, policies.reference(of), arguments.preferences, arguments.episodes,
             arguments.threads,
         )  # fmt: skip
         found = evaluation.evaluate(id_, policy, *options)
@@ -94,7 +97,7 @@ def main() -> None:
         low, high = before['distance_interval']
         if found['distance'] <= (high if has_policy else low):
             continue
-        entry = {'policy': arguments.policy, **({'preference': preference} if preference else {})}
+        entry = {'policy': of, **({'preference': preference} if preference else {})}
         runs.enter(policies.SHARED, id_, {**entry, 'evaluation': found})
         remove_unused(runs.read(policies.SHARED))
 

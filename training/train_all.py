@@ -29,7 +29,6 @@ import json
 import os
 import pathlib
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -49,7 +48,7 @@ from networks import trimmed
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.task_type import TASK_TYPES
-from trl_suite.util import errors
+from trl_suite.util import errors, files
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
@@ -107,10 +106,11 @@ def start_of(id_: str) -> str | None:
 
 
 def needed(id_: str) -> list[str]:
-    """Returns the environments whose policies a run uses: initial policy, footstep controller."""
+    """Returns the environments whose policies a run uses: at its start, by teachers, as controller."""
     spec = catalogue.BY_ID[id_]
     default = getattr(TASK_TYPES[spec.task_type].config(), 'controller', None)
-    found = (start_of(id_), spec.options.get('controller', default))
+    start = start_of(id_)
+    found = (start, spec.options.get('controller', default), *ppo.USED.get(start, ()))
     return [other for other in found if other in catalogue.BY_ID]
 
 
@@ -227,7 +227,7 @@ def given(id_: str) -> dict[str, bytes]:
 
 def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     """Evaluates a run; `begin` is the time of `time.monotonic` at its start."""
-    curve = json.loads((folder / 'curve.json').read_text())
+    curve = files.read_json(folder / 'curve.json')
     settings = curve['settings']
     # The last policy is used with curriculum stages, because the curve does not measure all skills,
     # and if it only imitates, because it has learnt from the most data.
@@ -312,9 +312,8 @@ def in_processes(arguments: argparse.Namespace) -> Callable[[str, int], Run]:
     def work(id_: str, seed: int) -> Run:
         output = pathlib.Path(arguments.runs)
         folder = output / id_ / f'seed_{seed}'
-        if arguments.overwrite and folder.exists():
-            with runs.only_run(folder):  # not while another process trains there
-                shutil.rmtree(folder)
+        if arguments.overwrite:
+            runs.remove(folder)
         return train(id_, seed, output, arguments.samples, arguments.machine)
 
     return work

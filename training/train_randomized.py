@@ -16,9 +16,7 @@ another folder than `trained`.
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
-import shutil
 from typing import Any
 
 import pages
@@ -53,11 +51,11 @@ def train(id_: str, seed: int, output: pathlib.Path) -> None:
     folder = output / id_ / f'seed_{seed}'
     ppo.train(id_, seed, randomized_settings_for(id_), folder, threads=1)
     policy = trimmed(policies.load(folder / 'policy.npz'))
-    curve = json.loads((folder / 'curve.json').read_text())
-    runs.write(
+    policies.save(policy, runs.place(place(id_)).with_suffix('.npz'))
+    curve = files.read_json(folder / 'curve.json')
+    runs.write(  # last: what is entered is not trained again
         place(id_), {**curve, 'machine': runs.machine(), 'shipped_at': policy.info['samples']}
     )
-    policies.save(policy, runs.place(place(id_)).with_suffix('.npz'))
 
 
 def measure(id_: str) -> dict[str, Any]:
@@ -120,7 +118,7 @@ def main() -> None:
     entries = []
     for id_ in tqdm.tqdm(arguments.ids, unit='run'):
         if arguments.overwrite:
-            shutil.rmtree(arguments.runs / id_ / f'seed_{arguments.seed}', ignore_errors=True)
+            runs.remove(arguments.runs / id_ / f'seed_{arguments.seed}')
         if arguments.overwrite or not runs.place(place(id_)).exists():
             train(id_, arguments.seed, arguments.runs)
         entries.append(measure(id_))

@@ -39,7 +39,6 @@ stores gaits that were found with `--within`. Needs `pip install 'trl_suite[tune
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -219,9 +218,12 @@ def default(
     scores = [
         bench.measure(each, FRICTIONS, seed).score(gait.target_speed).mean() for each in found
     ]
+    bench.environments.close()
     chosen = found[int(np.argmax(scores))]
     bench = Bench(gait.character, EPISODES, chosen)
-    return chosen, bench.measure(chosen, [FRICTION]).record(gait.target_speed)
+    record = bench.measure(chosen, [FRICTION]).record(gait.target_speed)
+    bench.environments.close()
+    return chosen, record
 
 
 def alone(
@@ -428,7 +430,7 @@ def main() -> None:
     action, gait = arguments.action, controllers.load(arguments.character)
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / f'{gait.character}.json'
-    found = json.loads(path.read_text()) if path.exists() else {}
+    found = files.read_json(path) if path.exists() else {}
     if action in ('enter', 'add'):
         print({'enter': enter, 'add': add}[action](gait.character, found, arguments.gaits))
         return
