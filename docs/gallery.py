@@ -26,12 +26,14 @@ import tqdm
 
 from trl_suite import characters, motion, policies, rendering, suite
 from trl_suite import terrain as terrains
+from trl_suite.arenas.scene import LOOKS
 from trl_suite.environments import named_policies as acting
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
+from trl_suite.util.digest import digest
 
 BUILT = 'curves', 'environments', 'terrains'  # folders that only the site has
 LARGEST = 40_000  # bytes of a picture
@@ -93,7 +95,8 @@ def items() -> Iterator[Item]:
         'suite.webp', functools.partial(moving.side_by_side, SUITE, SUITE_SECONDS, SUITE_SIZE)
     )
     for name, scene in FAMILIES.items():
-        yield Item(f'families/{name}.jpg', functools.partial(moment, *scene))
+        source = _policy_digest(scene[0]) + digest(LOOKS[name])
+        yield Item(f'families/{name}.jpg', functools.partial(moment, *scene), source)
     for name in characters.CHARACTERS:
         yield Item(character_path(name), functools.partial(character, name))
     for name in (*terrains.PRESETS, *terrains.PRESETS3D):
@@ -115,8 +118,8 @@ def _policy_digest(id: str) -> str:
     """Returns a digest of the policy that is shipped for an environment, '' if none is."""
     if id not in policies.available():
         return ''
-    digest, preference = _digest(f'{policies.trained_for(id)}.npz'), policies.preference_for(id)
-    return f'{digest} {preference:g}' if preference else digest
+    own, preference = _digest(f'{policies.trained_for(id)}.npz'), policies.preference_for(id)
+    return f'{own} {preference:g}' if preference else own
 
 
 def moving_path(id: str) -> str:
@@ -252,15 +255,14 @@ def terrain_length(terrain: terrains.Terrain) -> float:
 def scene(id: str) -> tuple[int, float, float, str]:
     """Returns what a film strip shows: seed, begin and end (s), camera.
 
-    Tasks with plans are rendered from behind, unless obstacles would hide the character.
+    Tasks with plans are rendered from behind.
     """
     spec = suite.find(id)
     if spec.id in SCENES:
         return SCENES[spec.id]
     if 'hierarchical' not in spec.tags:
         return SEED, 0.0, SECONDS, 'side'
-    hidden = 'obstacles' in terrains.load(spec.terrain).type
-    return SEED, 0.0, LONGER, 'above' if hidden else 'back'
+    return SEED, 0.0, LONGER, 'back'
 
 
 def film_strip(id: str) -> np.ndarray:

@@ -141,7 +141,9 @@ def environment_page(id: str) -> str:
             draws = f'{gallery.TERRAIN_DRAWS} samples of {spec.terrain}'
             text += f'\n\n{picture(draws, gallery.terrain_path(spec.terrain))}'
         (about if title.startswith(('Character', 'Links')) else rules).append(text)
-    return page(
+    # The search of the site takes an id for one word.
+    keywords = f'---\nmyst:\n  html_meta:\n    keywords: {spec.id.replace("_", " ")}\n---\n\n'
+    return keywords + page(
         spec.id,
         spec.description,
         strip(spec, environment),

@@ -216,7 +216,9 @@ class GalleryTest(FolderTest):
             self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
         self.assertContainsSubset(('suite.webp', 'terrains/gaps.png', 'terrains/plane.jpg'), paths)
         sources = [item.path for item in items if item.source]
-        self.assertLen(sources, len(policies.available()) + len(trained))  # film strips and curves
+        self.assertLen(
+            sources, len(policies.available()) + len(trained) + len(gallery.FAMILIES)
+        )  # film strips and curves
 
     def test_pictures(self):
         for only in (

@@ -10,8 +10,13 @@ function makeSortable(table) {
   const heads = [...table.tHead.rows[0].cells];
   const rows = [...table.tBodies[0].rows];
   if (rows.length < 3 || !heads.some(text)) return;
+  if (rows.some((row) => !text(row.cells[0]))) return; // a row without a name belongs to the one above
   table.classList.add('sortable', 'n-last');
   heads.forEach((head, column) => {
+    if (!text(head)) {
+      head.classList.add('no-sort');
+      return;
+    }
     head.tabIndex = 0;
     head.addEventListener('keydown', (event) => event.key === 'Enter' && head.click());
     const cells = rows.map((row) => row.cells[column]);
@@ -78,7 +83,7 @@ function makeBreakable(element) {
   });
 }
 
-document.querySelectorAll('article h1, article td :is(a, code), article td:first-child')
+document.querySelectorAll('article h1, article td :is(a, code), article td:first-child, .sidebar-tree a')
   .forEach(makeBreakable);
 const tables = [...document.querySelectorAll('article table')].filter((table) => table.tHead);
 tables.forEach(makeSortable);

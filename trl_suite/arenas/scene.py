@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 from dm_control import mjcf
 
 from trl_suite.engine import GRAVITY
@@ -26,7 +27,7 @@ class Look(NamedTuple):
     """Colours of a scene: red, green, blue in [0, 1]."""
 
     ground: tuple[Colour, Colour]  # light and dark squares
-    sky: tuple[Colour, Colour]  # above, and at the horizon
+    sky: tuple[Colour, Colour]  # above, and below; their mean is the horizon
     light: Colour  # of the camera's lamp, which adds to the sun that follows each character
 
 
@@ -83,6 +84,7 @@ def prepare(root: mjcf.RootElement, look: Look = OLIVE) -> None:
     # Contact forces, which viewers can show: red instead of MuJoCo's pale blue.
     root.visual.rgba.contactforce = (0.9, 0.2, 0.15, 1)
     root.visual.scale.forcewidth = 0.2
+    root.visual.rgba.haze = (*np.mean(look.sky, axis=0), 1)  # no line along the horizon
     sky = {'type': 'skybox', 'builtin': 'gradient', 'width': 64, 'height': 64}
     root.asset.add('texture', name='sky', rgb1=look.sky[0], rgb2=look.sky[1], **sky)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -87,6 +88,8 @@ def _shown(value: Any) -> str:
     if value is None or value is inspect.Parameter.empty:
         return '-'
     if isinstance(value, Range):
+        if (value.low, value.high) == (-math.pi, math.pi):
+            return '(-π, π)'
         value = value.low if value.low == value.high else tuple(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)

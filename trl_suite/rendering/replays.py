@@ -89,7 +89,7 @@ class Replay:
                 raise ValueError('the replay has no states')
             if kind is None:
                 self._recording.insert_sleep(self._seconds)
-                self.html = self._recording.as_html()
+                self.html = self._recording.as_html().replace('<title>Viser<', '<title>Replay<', 1)
                 if self._path is not None:
                     write_text(self.html, self._path)
         finally:
