@@ -20,7 +20,6 @@ from trl_suite.engine.world import STATE
 from trl_suite.vector import VectorEnvironment
 
 PLANAR = 'PD_Biped2D_LLC_Imitate_Flat-v0'
-SPATIAL = 'PD_Biped3D_Imitate-v0'
 MUSCLE = 'MTU_Biped2D_LLC_Imitate_Flat-v0'
 GAIT = 'FSM_Dog2D_Terrain_Gaps-v0'
 CHARACTERS = ('biped2d', 'biped3d')
@@ -290,7 +289,7 @@ class TorquePoseTest(parameterized.TestCase):
         # Torques that swing the right hip forward are limited to a tenth, others are not.
         entry = {'angle': [-3.0, 3.0], 'positive': [0.1, 0.1], 'negative': [1.0, 1.0]}
         environment = make('biped3d', model, torque_pose={'right_hip': entry})
-        own, other, forward = {}, [], []
+        other, forward = [], []
         limit = environment.task.character.torque_limits[1]
         joint = joint_of(environment, 'right_hip')
         rng = np.random.default_rng(3)

@@ -206,7 +206,7 @@ class ActionMapTest(parameterized.TestCase):
     def test_refused(self):
         turned = {'rotations': 'angle_axis'}
         assert_refused(self, *((lambda o=o: made('biped3d', 'position', **o), message) for o, message in (
-            ({'action_offset': np.zeros(7)}, 'action_offset'), ({'action_scale': [1.0] * 7}, ''),
+            ({'action_offset': np.zeros(7)}, 'action_offset'), ({'action_scale': [1.0] * 7}, 'action_scale'),
             ({'action_scale': 0}, 'action_scale'), ({'rotations': 'axis'}, "of rotations 'axis'"),
             ({'action_scale': 1.0, **turned}, 'do not pass action_offset'),
             ({'action_offset': np.zeros(22), **turned}, 'do not pass action_offset'),

@@ -535,7 +535,7 @@ class TerrainTest(CommandTest):
         self.assertTrue((iio.imread('c.png') != one).any())
         self.assert_only('terrain_gaps.png', 'b.png', 'c.png')
 
-    def test_a_policy_file(self):
+    def test_a_terrain_file(self):
         (self.folder / 'own').mkdir()
         (self.folder / 'own' / 'mine.json').write_text('{"Type": "var2d_gaps"}')
         self.assertEqual(self.output('terrain', 'own/mine.json'), 'terrain_mine.png\n')
@@ -575,7 +575,7 @@ class ProgramTest(CommandTest):
         self.assertRegex(self.output('--version'), r'^trl-suite \d+\.\d+\.\d+\n$')
 
     def test_a_missing_or_unknown_command_is_an_error(self):
-        self.assert_refused('required: command', *())
+        self.assert_refused('required: command')
         self.assert_refused("invalid choice: 'lst'", 'lst')
 
     def test_a_missing_extra_is_named(self):

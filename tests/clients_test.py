@@ -64,12 +64,6 @@ class GymnasiumTest(absltest.TestCase):
         # Random actions fell a walker within a second or so: 16 simulations of 256 steps.
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
 
-    def test_metadata_has_the_autoreset_mode(self):
-        """Also as an attribute, as in Gymnasium's vector environments: TorchRL reads it."""
-        for mode in gymnasium.vector.AutoresetMode:
-            envs = trl_suite.gym.SuiteVectorEnv(GAPS, 2, num_threads=1, autoreset_mode=mode)
-            self.assertIs(envs.autoreset_mode, mode)
-
 
 @needs('stable_baselines3', 'sb3')
 class StableBaselinesTest(CommandTest):

@@ -362,18 +362,14 @@ class SensorTest(parameterized.TestCase):
         ({'noise': 0.3}, {'pose': 0.3, 'velocity': 0.3, 'terrain': 0.3}),
     )  # fmt: skip
     def test_options_change_a_preset_where_they_name_it(self, options, changed):
-        steps, environment = [], made(PLANAR, sensors={'preset': 'robot', **options})
-        for _ in range(60):
-            environment.reset()
-            error = environment.step(zeros(environment)).observation
-            clean = environment.info['clean_observation']
-            steps.append(error['observations'] - clean)
-        found = np.array(steps)
-        for name in ('pose', 'velocity', 'terrain'):
-            [preset] = [b.noise.noise[1] for b in environment.task.observed if b.name == name]
-            part = found[:, environment.blocks[name]]
-            part = part - np.median(part, axis=1, keepdims=True) if name == 'terrain' else part
-            self.assertGreater(np.std(part), 0.6 * changed.get(name, preset))
+        blocks, stop = suite.build_task(suite.find(PLANAR)).observed, 0
+        exact = np.zeros((1, sum(block.size for block in blocks)))
+        data = sensors.sensor_data(SensorConfig(preset='robot', **options), blocks, exact, False)
+        for block in blocks:
+            part, stop = slice(stop, stop + block.size), stop + block.size
+            if not isinstance(block.noise, str):
+                expected = changed.get(block.name, block.noise.noise[1])
+                np.testing.assert_array_equal(data.noise[part], expected)
 
     @parameterized.parameters(*enumerate(('mild', 'robot', 'harsh')))
     def test_presets_are_those_of_the_blocks(self, level, preset):

@@ -134,15 +134,6 @@ class PagesTest(FolderTest):
 
 
 class TablesTest(FolderTest):
-    def test_text_between_comments(self):
-        page = self.folder / 'page.md'
-        page.write_text('a\n<!-- b, written by docs/generate.py -->\nold\n<!-- /b -->\nc\n')
-        with mock.patch.object(generate, 'DOCS', self.folder):
-            text = 'a\n<!-- b, written by docs/generate.py -->\nnew\n<!-- /b -->\nc\n'
-            self.assertEqual(generate.filled('page.md', {'b': 'new'}), text)
-            with self.assertRaisesRegex(ValueError, "page.md: expected the lines '<!-- d, written"):
-                generate.filled('page.md', {'d': 'new'})
-
     def test_returns_and_area_under_the_curve(self):
         curve = [(100_000, 0.5), (200_000, 1.0), (300_000, 1.0)]
         run = {

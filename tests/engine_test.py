@@ -50,12 +50,6 @@ def controls(steps, n=1, seed=0):
     return np.random.default_rng(seed).uniform(0, 1, (steps, n, 2))
 
 
-def state_of(model, data):
-    state = np.empty(mujoco.mj_stateSize(model, STATE))
-    mujoco.mj_getState(model, data, state, STATE)
-    return state
-
-
 class StepTest(parameterized.TestCase):
     """A step is `mj_step`, repeated."""
 

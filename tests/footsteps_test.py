@@ -683,18 +683,6 @@ class StartTest(parameterized.TestCase):
 class PushTest(parameterized.TestCase):
     """Forces on the torso."""
 
-    def test_pushes(self):
-        options = {'force': 80, 'duration': 0.2, 'interval': 0.5}
-        environment, _ = started(pushes=options)
-        impulses = []
-        for _ in range(60):
-            held(environment)
-            impulses.append(environment.info['impulse'])
-        # 15 steps without, 6 with, from the start on.
-        expected = ([0] * 15 + [80 / 30] * 6) * 2 + [0] * 15 + [80 / 30] * 3
-        np.testing.assert_allclose(np.linalg.norm(impulses, axis=1), expected, atol=1e-9)
-        np.testing.assert_array_equal(np.array(impulses)[:, 2], 0)
-
     def test_pushes_are_those_of_randomize(self):
         """Of the torso, with the same draws."""
         push = {'speed': (0.1, 0.5), 'duration': (0.1, 0.3), 'interval': (0.1, 0.3)}

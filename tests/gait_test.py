@@ -497,16 +497,6 @@ DO_NOT_FIT = (
 
 
 class OptionTest(parameterized.TestCase):
-    @parameterized.parameters((0.0, 0.1, 0.3), (1.0, 0.6, 1.4))
-    def test_terrain_level(self, level, low, high):
-        options = {'random': 0, 'terrain_level': level}
-        environment = suite.build('dog', None, 'gaps_curriculum', 'gait', task_kwargs=options)
-        environment.reset()
-        heights, vertical = environment.task.arena.grounds[0].window(0, 4000)
-        edges = np.flatnonzero(vertical)
-        widths = np.diff(edges)[heights[edges[:-1]] < -1]
-        self.assertBetween(widths.mean() * terrain.SPACING, low, high)
-
     def test_refused(self):
         assert_refused(
             self,

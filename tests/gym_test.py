@@ -316,6 +316,7 @@ class VectorTest(Same, parameterized.TestCase):
             envs = gymnasium.make_vec(f'trl_suite/{FLAT}', num_envs=4, num_threads=1, **options)
             self.assertIsInstance(envs, SuiteVectorEnv)
             self.assertIs(envs.metadata['autoreset_mode'], AutoresetMode(mode or 'NextStep'))
+            self.assertIs(envs.autoreset_mode, envs.metadata['autoreset_mode'])  # TorchRL reads it
             batch = batch_space(envs.single_observation_space, 4)
             self.assertEqual(envs.observation_space, batch)
             self.assertEqual(gymnasium.make_vec(envs.spec).num_envs, 4)

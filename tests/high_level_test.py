@@ -705,7 +705,6 @@ REFUSED = (
     ({'target_speed': 0}, 'target_speed is 0'), ({'goal_reached': np.inf}, 'goal_reached is'),
     ({'start_phases': ()}, 'start_phases is'), ({'start_phases': (0.1, 1.0)}, 'start_phases is'),
     ({'start_phases': (-0.1,)}, 'start_phases is'), ({'substeps': 5}, 'substeps is 5'),
-    ({'controller': 'PD_Biped3D_LLC_Genral_Step-v0'}, 'did you mean'),
     ({'start_phase': 0.1}, "unknown option.*'start_phases'"),
     ({'goal_distance': -1}, 'goal_distance is -1; expected None or a number or a lower and an upper bound'),
     ({'goal_distance': (5, 3)}, 'goal_distance is'), ({'step_length': 0}, 'step_length is 0'),

@@ -5,7 +5,7 @@ import itertools
 import mujoco
 import numpy as np
 from absl.testing import parameterized
-from helpers import assert_refused, assert_uniform, flattened, ground, made, put
+from helpers import assert_refused, assert_uniform, build, flattened, ground, made, put
 
 from trl_suite import motion, suite, terrain
 from trl_suite.tasks.common.control import start_phases
@@ -558,9 +558,12 @@ class ResetTest(parameterized.TestCase):
 
     def test_terrain_level_selects_the_parameters(self):
         # Gaps of 0.1 to 0.25 m in the first set, of 0.5 to 1.5 m in the second.
-        for level, low, high in ((0.0, 0.1, 0.3), (1.0, 0.6, 1.4)):
-            options = {'random': 0, 'terrain_level': level}
-            environment = suite.build('biped2d', terrain='gaps_curriculum', task_kwargs=options)
+        figures = ('biped2d', None, 'imitation'), ('dog', 'gait', 'gait')
+        levels = (0.0, 0.1, 0.3), (1.0, 0.6, 1.4)
+        for (figure, model, task), (level, low, high) in itertools.product(figures, levels):
+            environment = build(
+                suite.combine(figure, model, 'gaps_curriculum', task), {'terrain_level': level}
+            )
             environment.reset()
             heights, vertical = environment.task.arena.grounds[0].window(0, 4000)
             edges = np.flatnonzero(vertical)

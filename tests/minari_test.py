@@ -3,12 +3,9 @@
 import importlib.util
 import json
 import os
-import pathlib
-import tempfile
 import unittest
 from unittest import mock
 
-import cli_test
 import gymnasium
 import numpy as np
 
@@ -17,6 +14,7 @@ if importlib.util.find_spec('minari') is None:
 
 import minari
 from helpers import assert_uniform
+from programs import CommandTest
 
 from trl_suite.adapters import minari as adapter
 from trl_suite.vector import VectorEnvironment
@@ -24,10 +22,9 @@ from trl_suite.vector import VectorEnvironment
 ID = 'PD_Biped2D_Flat-v0'
 
 
-class DataSetTest(cli_test.CommandTest):
+class DataSetTest(CommandTest):
     def setUp(self):
         super().setUp()
-        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.enter('a')
 
     def enter(self, name):

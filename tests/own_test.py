@@ -18,7 +18,7 @@ import numpy as np
 import own_clip_test
 import trimesh
 from absl.testing import parameterized
-from helpers import FolderTest, assert_refused, in_this_process
+from helpers import FolderTest, assert_refused, assert_rows_are_singles, in_this_process
 from helpers import ground as heights_at
 
 from trl_suite import characters, cli, engine, motion, policies, suite, terrain
@@ -76,12 +76,6 @@ def compiled(row):
 def mesh_file(mesh, path):
     """Writes a mesh, in the format of the file's suffix; .txt.stl is an STL file as text."""
     mesh.export(path, file_type='stl_ascii' if path.name.endswith('.txt.stl') else None)
-
-
-def rolled(environment, actions):
-    """Returns observations and rewards of a single environment, in flat rows."""
-    steps = [environment.reset(), *map(environment.step, actions)]
-    return np.array([s.observation['observations'] for s in steps]), [s.reward for s in steps[1:]]
 
 
 class CharacterTest(WrittenTest):
@@ -714,14 +708,7 @@ class TerrainTest(WrittenTest):
     @parameterized.parameters(('biped2d', vee), ('biped3d', bowl))
     def test_a_batch_is_bit_for_bit_the_single_environments(self, character, function):
         spec = suite.combine(character, terrain=terrain.from_function(function, start_span=3))
-        many = VectorEnvironment(spec, 3, seed=1)
-        actions = np.random.default_rng(0).uniform(-1, 1, (12, 3, len(many.action_map)))
-        first = many.reset()
-        seen = np.array([first, *(many.step(action).observation for action in actions)])
-        for i in (0, 2):
-            options = {'random': int(many.seeds[i])}
-            single = suite.build_environment(spec, options, {'flat_observation': True})
-            np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
+        assert_rows_are_singles(spec, 3, 12, 256, seed=1)
 
     def test_invalid_arguments_are_rejected(self):
         f = self.folder
@@ -854,12 +841,9 @@ class TaskTest(parameterized.TestCase):
         plain = VectorEnvironment(id, 3, seed=2)
         count = 2 if id.startswith('FSM') else 20  # whole cycles
         actions = np.random.default_rng(0).uniform(-1, 1, (count, 3, len(many.action_map)))
-        seen, rewards = [many.reset()], []
-        np.testing.assert_array_equal(seen[0][:, :-3], plain.reset())
+        np.testing.assert_array_equal(many.reset()[:, :-3], plain.reset())
         for action in actions:
             step, other = many.step(action), plain.step(action)
-            seen.append(step.observation)
-            rewards.append(step.reward)
             np.testing.assert_array_equal(step.observation[:, :-3], other.observation)
             np.testing.assert_array_equal(step.terminated, other.terminated)
             terms = step.info['reward_terms']
@@ -868,10 +852,7 @@ class TaskTest(parameterized.TestCase):
                 step.reward - terms['fast'] - terms['lazy'], other.reward, atol=1e-12
             )
             self.assertEqual(step.observation.shape[1], many.blocks['angles'].stop)
-        single = suite.make(id, {'random': int(many.seeds[1]), **PARTS}, {'flat_observation': True})
-        found, gained = rolled(single, actions[:, 1])
-        np.testing.assert_array_equal(found, np.array(seen)[:, 1])
-        np.testing.assert_array_equal([r or 0.0 for r in gained], np.array(rewards)[:, 1])
+        assert_rows_are_singles(id, 3, count, 256, PARTS, seed=2)
 
     def test_no_term_is_added_at_a_fall(self):
         options = {'rewards': {'one': (0.5, lambda task: np.ones(task.world.n))}}

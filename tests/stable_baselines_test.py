@@ -26,6 +26,8 @@ SMALL = {'height': 48, 'width': 64}
 
 
 class StableBaselinesTest(parameterized.TestCase):
+    """Simulations against single environments, wrappers, and a learner."""
+
     def test_a_fall_in_the_step_of_the_limit_is_no_truncation(self):
         one, steps = SuiteVecEnv(GAPS, 1, 1, seed=[1]), 1
         one.reset()
@@ -35,8 +37,6 @@ class StableBaselinesTest(parameterized.TestCase):
         one.reset()
         *_, (_, _, done, [info]) = (one.step(np.zeros((1, 11))) for _ in range(steps))
         self.assertEqual((done[0], info['fell'], info['TimeLimit.truncated']), (True, True, False))
-
-    """Simulations against single environments, wrappers, and a learner."""
 
     @parameterized.parameters(True, False)
     def test_simulations_equal_those_of_dummy_vec_env(self, flat):

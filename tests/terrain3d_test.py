@@ -4,6 +4,7 @@ import functools
 import itertools
 import math
 import pickle
+from unittest import mock
 
 import numpy as np
 from absl.testing import parameterized
@@ -589,9 +590,7 @@ class FileTest(parameterized.TestCase):
 class RegisterTest(parameterized.TestCase):
     def setUp(self):
         super().setUp()
-        before = dict(generators._spatial)
-        self.addCleanup(generators._spatial.update, before)
-        self.addCleanup(generators._spatial.clear)
+        self.enterContext(mock.patch.dict(generators._spatial))
 
     def test_new_type(self):
         @terrain.register3d('turned3d', {'YawMin': 0.2, 'YawMax': 0.4})

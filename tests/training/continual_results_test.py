@@ -12,8 +12,6 @@ from helpers import FolderTest
 from trl_suite import evaluation, sequences
 from trl_suite.runs import results
 
-IDS = sequences.get('plaid_biped').ids
-
 
 class Fixed:
     """Takes no samples."""

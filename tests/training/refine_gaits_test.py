@@ -1,6 +1,7 @@
 """PPO over base actions: initial policy, advantages, the exported policy, exact resumption."""
 
 import dataclasses
+import functools
 import json
 from unittest import mock
 
@@ -22,13 +23,19 @@ SMALL = refine_gaits.Settings(
 )  # fmt: skip
 
 
-def make(**changes):
-    """A run that begins with the policy of a short Q-learning."""
+@functools.cache
+def initial_policy():
+    """The policy of a short Q-learning."""
     learner = learn_gaits.Learner(HOPPER, 1, FIRST, 1)
     for _ in range(6):
         learner.advance()
     learner.finish()
-    initial, settings = learner.exported(), dataclasses.replace(SMALL, **changes)
+    return learner.exported()
+
+
+def make(**changes):
+    """A run that begins with this policy, and the policy."""
+    initial, settings = initial_policy(), dataclasses.replace(SMALL, **changes)
     return refine_gaits.Refiner(HOPPER, 1, settings, 1, initial), initial
 
 

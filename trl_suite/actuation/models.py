@@ -209,14 +209,15 @@ def _add_position(
         turn = np.minimum(POSITION_SCALE, original)
         action_scale = _spread(character, np.where(character.prismatic, slide, turn))
     scale = errors.floats(f'action_scale of {character.spec.name!r}', action_scale)
-    reach = np.broadcast_to(scale, len(names)).copy()
-    if middle.shape != (len(names),) or not np.all(reach > 0):
+    fits = middle.shape == (len(names),) and scale.shape in ((), (1,), (len(names),))
+    if not fits or not np.all(scale > 0):
         raise ValueError(
             f'position control of {character.spec.name!r}: action_scale must be positive, and '
             f'action_offset and action_scale broadcast to ({len(names)},)'
         )
     quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')
+    reach = np.broadcast_to(scale, len(names)).copy()
     return ActionMap(names, quantity, unit, middle, reach, tuple(character.spec.joints))
 
 
