@@ -28,10 +28,10 @@ def fill_normal(i, state, out):
 
 
 def seeded(*seeds):
-    streams = random.Streams(len(seeds))
+    state = np.zeros((len(seeds), 6), np.uint64)
     for i, seed in enumerate(seeds):
-        streams.seed(i, np.random.SeedSequence(seed))
-    return streams
+        random.seed_stream(i, np.random.SeedSequence(seed), state)
+    return state
 
 
 class StreamsTest(parameterized.TestCase):
@@ -41,37 +41,37 @@ class StreamsTest(parameterized.TestCase):
     def test_numbers_are_those_of_numpy(self, seed):
         streams, expected = seeded(1, seed), np.random.default_rng(seed)
         found = np.empty(COUNT)
-        fill_random(1, streams.state, found)
+        fill_random(1, streams, found)
         np.testing.assert_array_equal(found, expected.random(COUNT))
-        fill_uniform(1, -0.3, 1e3, streams.state, found)
+        fill_uniform(1, -0.3, 1e3, streams, found)
         np.testing.assert_array_equal(found, expected.uniform(-0.3, 1e3, COUNT))
-        fill_normal(1, streams.state, found)
+        fill_normal(1, streams, found)
         np.testing.assert_array_equal(found, expected.standard_normal(COUNT))
         self.assertGreater(np.abs(found).max(), 3.66)  # in the tail
-        fill_random(1, streams.state, found[:9])  # as many bits were drawn
+        fill_random(1, streams, found[:9])  # as many bits were drawn
         np.testing.assert_array_equal(found[:9], expected.random(9))
 
     def test_python_and_compiled_functions_alternately(self):
         streams, expected = seeded(11), np.random.default_rng(11)
         found = np.empty(7)
         for _ in range(3):
-            fill_normal(0, streams.state, found)
+            fill_normal(0, streams, found)
             np.testing.assert_array_equal(found, expected.standard_normal(7))
-            with streams.generator(0) as generator:
+            with random._continued(streams[0]) as generator:
                 # 32 bits of a word remain in the buffer.
                 self.assertEqual(generator.integers(5), expected.integers(5))
                 draw = generator.uniform(-np.pi, np.pi), generator.permutation(9).tolist()
             self.assertEqual(
                 draw, (expected.uniform(-np.pi, np.pi), expected.permutation(9).tolist())
             )
-            with streams.generator(0) as generator:
+            with random._continued(streams[0]) as generator:
                 self.assertEqual(generator.bit_generator.state, expected.bit_generator.state)
 
     def test_streams_are_independent(self):
         streams = seeded(20, 21)
-        before, numbers = streams.state[0].copy(), np.empty(50)
-        fill_normal(1, streams.state, numbers)
-        np.testing.assert_array_equal(streams.state[0], before)
+        before, numbers = streams[0].copy(), np.empty(50)
+        fill_normal(1, streams, numbers)
+        np.testing.assert_array_equal(streams[0], before)
 
 
 class DrawTest(parameterized.TestCase):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -106,12 +107,16 @@ class Block:
 
 def layout(blocks: Iterable[Block]) -> dict[str, slice]:
     """Returns the slices of consecutive blocks, by name; empty blocks are left out."""
-    found, stop = {}, 0
-    for block in blocks:
-        if block.size:
-            found[block.name] = slice(stop, stop + block.size)
-        stop += block.size
-    return found
+    return slices({block.name: block.size for block in blocks if block.size})
+
+
+def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Returns the slices of consecutive parts with these sizes, by name."""
+    stops = itertools.accumulate(sizes.values())
+    return {
+        name: slice(stop - size, stop)
+        for (name, size), stop in zip(sizes.items(), stops, strict=True)
+    }
 
 
 def columns(blocks: Iterable[Block], of: Iterable[Block] | None = None) -> Any:

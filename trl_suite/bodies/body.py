@@ -9,15 +9,13 @@ that are written for measurements are for both.
 from __future__ import annotations
 
 import abc
-import itertools
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap, Drive
-from trl_suite.bodies.blocks import Block, columns
+from trl_suite.bodies.blocks import Block, columns, slices
 from trl_suite.bodies.state import FLAG, PLACE, REAL, allocated
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
@@ -76,15 +74,6 @@ def feature_columns(rotations: int, angles: int, rates: int, effectors: int) -> 
         'height': 1,
     }
     return slices(sizes)
-
-
-def slices(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Returns the slices of consecutive parts with these sizes, by name."""
-    stops = itertools.accumulate(sizes.values())
-    return {
-        name: slice(stop - size, stop)
-        for (name, size), stop in zip(sizes.items(), stops, strict=True)
-    }
 
 
 @compiled_inline

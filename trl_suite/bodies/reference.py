@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.bodies.blocks import CLOCK, Block, Reflection
-from trl_suite.bodies.body import Body, Measurement, slices
+from trl_suite.bodies.blocks import CLOCK, Block, Reflection, slices
+from trl_suite.bodies.body import Body, Measurement
 from trl_suite.bodies.state import REAL, WHOLE, allocated
 from trl_suite.engine.world import WRITABLE
 from trl_suite.motion import Clip, FootstepLibrary, quaternion

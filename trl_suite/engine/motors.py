@@ -191,7 +191,7 @@ def motors(
         times=np.zeros((n, slots), int),
         controls=np.zeros((n, slots, models[0].nu)),
         noise=np.zeros((n, dofs)),
-        stream=random.Streams(n).state,
+        stream=np.zeros((n, 6), np.uint64),
     )
     return Motors(np.array(fields, np.int64), limits, noise, state)
 

@@ -27,7 +27,7 @@ class PushState(NamedTuple):
       begin, end: simulated time at which it begins and ends, (n, P) s; infinite if there is none.
       force: (n, P, 3) N.
       impulse: impulse of all pushes since the array was last cleared, (n, 3) N s.
-      stream: random stream, see `trl_suite.util.random.Streams`, (n, 6).
+      stream: random stream, see `trl_suite.util.random.seed_stream`, (n, 6).
     """
 
     begin: np.ndarray

@@ -10,7 +10,6 @@ import numpy as np
 
 from trl_suite.bodies.blocks import Block
 from trl_suite.engine import World
-from trl_suite.util.random import Streams
 
 if TYPE_CHECKING:
     from trl_suite.tasks.rewards import Outcome
@@ -109,13 +108,6 @@ def position(random_state: np.random.RandomState) -> tuple[Any, ...]:
     state: Any = random_state.get_state()
     _, keys, *rest = state
     return int(keys[0]), *rest
-
-
-def seeded(env_id: int, seed: np.random.SeedSequence, stream: np.ndarray) -> None:
-    """Seeds the stream of one simulation."""
-    streams = Streams(1)
-    streams.seed(0, seed)
-    stream[env_id] = streams.state[0]
 
 
 def spawned(seed: np.random.SeedSequence, key: int) -> np.random.SeedSequence:

@@ -1,8 +1,8 @@
 """Random numbers in compiled functions: NumPy's PCG64, one stream per simulation.
 
-    streams = Streams(n)
-    streams.seed(3, np.random.SeedSequence(7))
-    uniform(3, 0.2, 0.7, streams.state)  # as np.random.default_rng(...).uniform(0.2, 0.7)
+    state = np.zeros((n, 6), np.uint64)
+    seed_stream(3, np.random.SeedSequence(7), state)
+    uniform(3, 0.2, 0.7, state)  # as np.random.default_rng(...).uniform(0.2, 0.7)
 
 The numbers are bit-identical to those of `numpy.random.Generator`, so that Python and compiled
 functions can draw from the same stream alternately. Compiled functions can also draw from a NumPy
@@ -32,24 +32,16 @@ _TAIL, _INVERSE_TAIL = 3.6541528853610087963519472518, 0.27366123732975827203338
 _DOUBLE = 1.0 / 9007199254740992.0
 
 
-class Streams:
-    """A PCG64 stream for each of n simulations.
+def seed_stream(i: int, sequence: np.random.SeedSequence, state: np.ndarray) -> None:
+    """Seeds stream i as `np.random.default_rng(sequence)` would be.
 
-    Attributes:
+    Args:
+      i: number of the stream.
+      sequence: the seed.
       state: (n, 6) uint64; high and low words of state and increment, then `has_uint32` and
         `uinteger`, the buffered 32 bits.
     """
-
-    def __init__(self, n: int) -> None:
-        self.state = np.zeros((n, 6), np.uint64)
-
-    def seed(self, env_id: int, sequence: np.random.SeedSequence) -> None:
-        """Seeds a stream as `np.random.default_rng(sequence)` would be."""
-        _store(np.random.PCG64(sequence), self.state[env_id])
-
-    def generator(self, env_id: int) -> contextlib.AbstractContextManager[np.random.Generator]:
-        """Returns a context with a Generator that continues a stream, which follows at the exit."""
-        return _continued(self.state[env_id])
+    _store(np.random.PCG64(sequence), state[i])
 
 
 @contextlib.contextmanager

@@ -10,7 +10,8 @@ from trl_suite.actuation import realism, series, strength_curves
 from trl_suite.actuation.realism import Actuators
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.tasks.component import MOTORS, Component, seeded, spawned
+from trl_suite.tasks.component import MOTORS, Component, spawned
+from trl_suite.util.random import seed_stream
 
 if TYPE_CHECKING:
     from trl_suite.tasks.rewards import Outcome
@@ -108,7 +109,7 @@ class Motors(Component):
         state.strength[env_id] = rng.uniform(*self.actuators.strength, state.strength.shape[1])
         state.lag[env_id] = self._steps(rng.uniform(*self.actuators.delay))
         state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
-        seeded(env_id, own.spawn(1)[0], self.motors.stream)
+        seed_stream(env_id, own.spawn(1)[0], self.motors.stream)
         self.restored(env_id)
 
     def restored(self, env_id: int) -> None:

@@ -10,12 +10,13 @@ import numpy as np
 
 from trl_suite.engine import World
 from trl_suite.engine.pushes import DIRECTION, DURATION, FORCE, INTERVAL, draw
-from trl_suite.tasks.component import PUSH, Component, seeded, spawned
+from trl_suite.tasks.component import PUSH, Component, spawned
 from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Marker, Task
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
 from trl_suite.util.options import Config, Range, option, within
+from trl_suite.util.random import seed_stream
 
 COLOUR = (0.9, 0.2, 0.15, 1.0)
 _METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
@@ -94,7 +95,7 @@ class Pushes(Component):
     def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
         state = self._pushes.state
         if not self._series:
-            seeded(env_id, spawned(seed, PUSH), state.stream)
+            seed_stream(env_id, spawned(seed, PUSH), state.stream)
         state.impulse[env_id] = 0.0
         first_push(env_id, self._series, self.task.world.pack)
 

@@ -17,13 +17,13 @@ import numpy as np
 from trl_suite.bodies.blocks import LEVELS, Block, layout
 from trl_suite.bodies.state import WHOLE, allocated
 from trl_suite.engine import World
-from trl_suite.tasks.component import SENSORS, Component, seeded, spawned
+from trl_suite.tasks.component import SENSORS, Component, spawned
 from trl_suite.tasks.rewards import Outcome
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, packed
 from trl_suite.util.options import Config, Range, checked, option
-from trl_suite.util.random import random, standard_normal
+from trl_suite.util.random import random, seed_stream, standard_normal
 
 TERRAIN_DROPOUT = (0.01, 0.05, 0.15)  # of the presets
 MOST_DELAY = 1000  # steps
@@ -86,7 +86,7 @@ class SensorState(NamedTuple):
       missing: whether a number is missing at present, (n, size).
       delay: age of each number, (n, size) steps.
       history: exact observations of the last steps, (n, depth, size); depth 0 without delay.
-      stream: random stream, see `trl_suite.util.random.Streams`, (n, 6).
+      stream: random stream, see `trl_suite.util.random.seed_stream`, (n, 6).
       head: place of the current observation in the history, (n,).
     """
 
@@ -303,7 +303,7 @@ class Sensors(Component):
         return Outcome(data.state.observation, *outcome[1:])
 
     def begin(self, env_id: int, seed: np.random.SeedSequence) -> None:
-        seeded(env_id, spawned(seed, SENSORS), self._state.stream)
+        seed_stream(env_id, spawned(seed, SENSORS), self._state.stream)
 
     def finish(self, env_ids: np.ndarray, fresh: bool) -> None:
         sense_all(env_ids, fresh, self._pack)
