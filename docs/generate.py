@@ -48,7 +48,7 @@ NAMES = (  # parts of ids
     ('`FULL`', 'the three-dimensional biped with arms and head'),
     (
         '`…_Terrain-v0` of a biped, dog or raptor',
-        'the ground is observed; without this part, it is flat or not observed',
+        'in imitation and PLAiD: the ground is observed',
     ),
 )
 WITHOUT = {  # policies shown for environments without a shipped policy
@@ -398,7 +398,7 @@ def terrain_index() -> str:
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Terrains',
-        'Terrain is generated anew in every episode, except `cliff3d`. `trl-suite terrain NAME` plots random samples of a '
+        'Terrain is random in every episode, except flat ground, ramps, checkers, paths and `cliff3d`. `trl-suite terrain NAME` plots random samples of a '
         'preset or of a parameter file. For terrain from a function, an image or a mesh see '
         '[Make your own](make_your_own.md).',
         *parts,
