@@ -165,7 +165,7 @@ class Additions(Component):
             raise ValueError(f'{kind} {name!r} has shape {value.shape}; expected {expected}')
         with np.errstate(over='ignore'):
             value = weight * value
-        finite = (np.abs(value) <= LARGEST).all(1)  # also as float32, and in sums
+        finite = np.all(np.abs(value) <= LARGEST, axis=1)  # also as float32, and in sums
         if not finite.all():
             if not (finite | diverged).all():
                 raise ValueError(
