@@ -142,7 +142,8 @@ def environment_page(id: str) -> str:
             text += f'\n\n{picture(draws, gallery.terrain_path(spec.terrain))}'
         (about if title.startswith(('Character', 'Links')) else rules).append(text)
     # The search of the site takes an id for one word.
-    keywords = f'---\nmyst:\n  html_meta:\n    keywords: {spec.id.replace("_", " ")}\n---\n\n'
+    words = spec.id.removesuffix('-v0').replace('_', ', ')
+    keywords = f'---\nmyst:\n  html_meta:\n    keywords: {words}\n---\n\n'
     return keywords + page(
         spec.id,
         spec.description,
