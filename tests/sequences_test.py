@@ -412,8 +412,12 @@ class RunTest(RunCase):
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Keeper(1))
         shutil.copytree(self.folder / 'result.stage1', self.folder / 'result.stage2')
+        shutil.copytree(self.folder / 'result.stage1', self.folder / 'kept')
         (self.folder / '.result.json.lock').write_text('1234')
         self.assertLen(self.run_short(Keeper())['scores'], 3)
+        self.assert_only('result.json', 'kept')
+        (self.folder / 'kept').rename(self.folder / 'result.stage1')  # killed after its last stage
+        self.run_short(Keeper())
         self.assert_only('result.json')
 
     @parameterized.parameters(1, 2)

@@ -48,8 +48,8 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
         than one of B in the same environment.
 
     Raises:
-      ValueError: no results, one of a run that has not ended, results of several budgets or lengths of tests, a run that is there twice, or
-        learners without a common environment or seed.
+      ValueError: no results, one of a run that has not ended, results of several budgets or
+        lengths of tests, a run that is there twice, or learners without a common environment or seed.
     """
     found: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
     for result in results:

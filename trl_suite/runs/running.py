@@ -141,10 +141,8 @@ class Benchmark(results.Format):
         with files.locked(path.with_name(f'.{path.name}.lock'), what):
             if path.exists():
                 result = self._resumed(path, result, learner, count)
-                if len(result['scores']) >= stages:
-                    if progress:
-                        print(f'{path} is finished; remove it to run again', file=sys.stderr)
-                    return result
+                if progress and len(result['scores']) >= stages:
+                    print(f'{path} is finished; remove it to run again', file=sys.stderr)
             else:
                 # Else a folder or a policy of the user would be removed.
                 for own in (path.with_suffix('.npz'), *(_state(path, n) for n in range(1, count))):
