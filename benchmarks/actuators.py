@@ -284,7 +284,7 @@ def cost_table(found: dict[str, dict[str, float]]) -> str:
         [name, *(f'{found[title].get(name, np.nan):.2f}'.replace('nan', '-') for title in found)]
         for name in OPTIONS
     ]
-    return tables.markdown_table(tables.Table(('option', *found), rows))
+    return tables.markdown_table(('option', *found), rows)
 
 
 def effect_table(found: dict[str, object]) -> str:
@@ -296,13 +296,13 @@ def effect_table(found: dict[str, object]) -> str:
             ', '.join(f'{share:.2f}' for share in row.get(name, ())) or '-' for name in STRENGTHS
         ]
         rows.append([title, f'{row["ideal"]:.0f}', *cells])
-    return tables.markdown_table(tables.Table(('policy', 'return, ideal', *STRENGTHS), rows))
+    return tables.markdown_table(('policy', 'return, ideal', *STRENGTHS), rows)
 
 
 def page() -> None:
     """Writes the tables between their markers."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
-    parts = {'options': tables.markdown_table(table_of(actuation.Actuators))}
+    parts = {'options': tables.markdown([table_of(actuation.Actuators)])}
     if 'costs' in found:
         parts['costs'] = cost_table(found['costs'])
     if 'effects' in found:

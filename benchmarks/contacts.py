@@ -29,7 +29,7 @@ import numpy as np
 import tqdm
 
 from trl_suite import policies, suite
-from trl_suite.util import files
+from trl_suite.util import files, tables
 from trl_suite.util.program import begin_script
 
 WALKS = {
@@ -277,21 +277,16 @@ def _text(row: dict[str, float]) -> str:
 def table(found: dict[str, Any]) -> str:
     """Returns the results as Markdown."""
     results = found['results']
-    lines = [
+    title = (
         f'Means of {found["episodes"]} episodes of at most 256 steps: return / lift-offs per foot and second '
-        '(of these, shorter than 50 ms) / largest force in body weights (99th percentile) / depth of the soles below the ground in mm.',
-        '',
-        '| change | ' + ' | '.join(WALKS) + ' |',
-        '| --- ' * (1 + len(WALKS)) + '|',
-    ]
-    for name, *_ in CHANGES:
-        row = [_text(results[id_][name]) for id_ in WALKS.values()]
-        lines.append(f'| {name} | ' + ' | '.join(row) + ' |')
+        '(of these, shorter than 50 ms) / largest force in body weights (99th percentile) / depth of the soles below the ground in mm.'
+    )
+    rows = [(name, *(_text(results[id_][name]) for id_ in WALKS.values())) for name, *_ in CHANGES]
     words = {'Torque': 'torque control', 'MTU': 'muscles', 'Vel': 'velocity control'}
     for model in OTHERS:
-        row = [_text(results[id_.replace('PD_', f'{model}_', 1)]['none']) for id_ in WALKS.values()]
-        lines.append(f'| {words[model]} | ' + ' | '.join(row) + ' |')
-    return '\n'.join(lines)
+        ids = (id_.replace('PD_', f'{model}_', 1) for id_ in WALKS.values())
+        rows.append((words[model], *(_text(results[id_]['none']) for id_ in ids)))
+    return f'{title}\n\n{tables.markdown_table(("change", *WALKS), rows)}'
 
 
 def main() -> None:

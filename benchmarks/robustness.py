@@ -21,7 +21,7 @@ import tqdm
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
-from trl_suite.util import files
+from trl_suite.util import files, tables
 from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
@@ -181,27 +181,24 @@ def table(found: dict[str, Any]) -> str:
     for id_ in ids:
         families.setdefault(catalogue.find(id_).domain, []).append(id_)
     for family, of_family in families.items():
-        lines += ['', f'### Shipped policies: {family}', '', *family_table(found, of_family)]
+        lines += ['', f'### Shipped policies: {family}', '', family_table(found, of_family)]
     return '\n'.join(lines)
 
 
-def family_table(found: dict[str, Any], ids: list[str]) -> list[str]:
-    """Returns the lines of one table: a row for each disturbance, a column for each environment."""
-    lines = [
-        '| disturbance | strengths | ' + ' | '.join(f'`{id_}`' for id_ in ids) + ' |',
-        '|---' * (2 + len(ids)) + '|',
-    ]
+def family_table(found: dict[str, Any], ids: list[str]) -> str:
+    """Returns one table: a row for each disturbance, a column for each environment."""
+    rows = []
     for name, unit, _, strengths in DISTURBANCES:
         shares = [[share(found, id_, f'{name}: {text}') for text, _ in strengths] for id_ in ids]
         if all(set(each) == {'–'} for each in shares):
             continue
         texts = ', '.join(text for text, _ in strengths)
         entries = ['–' if set(each) == {'–'} else ' '.join(each) for each in shares]
-        lines.append(f'| {name} | {f"{texts} {unit}".strip()} | ' + ' | '.join(entries) + ' |')
+        rows.append((name, f'{texts} {unit}'.strip(), *entries))
     none = [pooled(found, id_, 'none') or (math.nan, math.nan) for id_ in ids]
-    returns = ' | '.join(f'{mean:.0f} ± {interval:.1f}' for mean, interval in none)
-    lines.append(f'| none: the return itself | 95 % confidence | {returns} |')
-    return lines
+    returns = (f'{mean:.0f} ± {interval:.1f}' for mean, interval in none)
+    rows.append(('none: the return itself', '95 % confidence', *returns))
+    return tables.markdown_table(('disturbance', 'strengths', *(f'`{id_}`' for id_ in ids)), rows)
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from trl_suite import benchmark
 from trl_suite.benchmark.report import LEVELS, report, table
-from trl_suite.util import files
+from trl_suite.util import files, tables
 from trl_suite.util.program import begin_script
 
 DOCS = pathlib.Path(__file__).resolve().parent
@@ -32,10 +32,7 @@ BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_
 def core(found: dict[str, Any]) -> str:
     """Returns the table of the core set; how hard each is follows from the best learner's score."""
     measured = benchmark.scales()
-    lines = [
-        '| environment | tests | 0 is | 1 is | episodes | best learner |',
-        '|--|--|--:|--:|--:|--:|',
-    ]
+    rows = []
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
         best = '–'
@@ -44,11 +41,10 @@ def core(found: dict[str, Any]) -> str:
                 np.mean([run[-1] for run in of['scores'][id]]) for of in found['learners'].values()
             ]
             best = f'{max(scores):.2f}'
-        lines.append(
-            f'| `{id}` | {course.description} | {low:.3f} | {high:.3f} '
-            f'| {measured[id]["episodes"]} | {best} |'
-        )
-    return '\n'.join(lines)
+        ends = f'{low:.3f}', f'{high:.3f}'
+        rows.append((f'`{id}`', course.description, *ends, measured[id]['episodes'], best))
+    header = 'environment', 'tests', '0 is', '1 is', 'episodes', 'best learner'
+    return tables.markdown_table(header, rows)
 
 
 def count_of(levels: str) -> str:
@@ -58,20 +54,26 @@ def count_of(levels: str) -> str:
 
 def levels() -> str:
     """Returns the table of scores on levels of training and on others, and their picture."""
-    lines = [
-        '| environment | levels | runs | on these levels | on others | gap, and its range over runs |',
-        '|--|--:|--:|--:|--:|--:|',
-    ]
+    rows = []
     for id, counts in files.read_json(FOLDER / 'levels.json').items():
         for count, scores in counts.items():
             own, others = np.mean(scores, 0)
             gaps = np.subtract(*np.transpose(scores))
             span = f' ({min(gaps):.3f} to {max(gaps):.3f})' if len(scores) > 1 else ''
-            lines.append(
-                f'| `{id}` | {count_of(count)} | {len(scores)} | {own:.3f} | {others:.3f} | {own - others:.3f}{span} |'
-            )
+            rows.append((
+                f'`{id}`', count_of(count), len(scores), f'{own:.3f}', f'{others:.3f}',
+                f'{own - others:.3f}{span}',
+            ))  # fmt: skip
     picture = '![Mean return on the levels of training and on others](benchmark/levels.svg)'
-    return '\n'.join((*lines, '', picture))
+    header = (
+        'environment',
+        'levels',
+        'runs',
+        'on these levels',
+        'on others',
+        'gap, and its range over runs',
+    )
+    return f'{tables.markdown_table(header, rows)}\n\n{picture}'
 
 
 def entries() -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -105,12 +107,12 @@ def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[list[fl
 
 def further(results: list[dict[str, Any]]) -> str:
     """Returns the table of results that are not in the report."""
-    lines = ['| environment | learner | seeds | score |', '|--|--|--:|--:|']
+    rows = []
     for learner, found in curves_of(results).items():
         for id, runs in found.items():
             score = np.mean([run[-1] for run in runs])
-            lines.append(f'| `{id}` | {learner} | {len(runs)} | {score:.3f} |')
-    return '\n'.join(lines)
+            rows.append((f'`{id}`', learner, len(runs), f'{score:.3f}'))
+    return tables.markdown_table(('environment', 'learner', 'seeds', 'score'), rows)
 
 
 def leaderboard(found: dict[str, Any], others: list[dict[str, Any]]) -> str:

@@ -21,7 +21,6 @@ from typing import Any
 
 import gallery
 import papers
-from papers import table
 
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.actuation.muscles import MUSCLES
@@ -31,7 +30,8 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.variation import pushes, sensors, worlds
-from trl_suite.util import errors, files
+from trl_suite.util import errors, files, tables
+from trl_suite.util.tables import markdown_table as table
 
 DOCS = pathlib.Path(__file__).resolve().parent
 SOURCES = 'trl_suite', 'trained', 'xml', 'mocap'  # what the pages of the site describe
@@ -136,7 +136,7 @@ def environment_page(id: str) -> str:
     )
     about, rules = [], []
     for title, parts in describe.parts(spec, environment):
-        text = f'## {describe.escape(title)}\n\n{describe.markdown(parts)}'
+        text = f'## {tables.escape(title)}\n\n{tables.markdown(parts)}'
         if title.startswith('Terrain'):
             draws = f'{gallery.TERRAIN_DRAWS} samples of {spec.terrain}'
             text += f'\n\n{picture(draws, gallery.terrain_path(spec.terrain))}'
@@ -154,7 +154,7 @@ def environment_page(id: str) -> str:
         *rules,
         *about,
         '## Differences from the original\n\n'
-        + '\n'.join(f'- {describe.escape(text)}' for text in describe.differences_of(spec))
+        + '\n'.join(f'- {tables.escape(text)}' for text in describe.differences_of(spec))
         + '\n\nReasons are in [Differences from the original](../differences.md).',
     )
 
@@ -306,7 +306,7 @@ def character_page(name: str) -> str:
             else 'It moves in the x-z plane.'
         ),
         '## Links and joints',
-        describe.markdown_table(joints),
+        tables.markdown([joints]),
         'Limits are torque limits; kp and kd are the gains of position control (velocity control uses '
         'kd), before the actuation model splits the damping between servo and joint.',
         table(
@@ -432,7 +432,7 @@ def option_tables() -> dict[str, str]:
         'randomize': worlds.WorldConfig, 'push': pushes.PushConfig, 'sensors': sensors.SensorConfig,
     }  # fmt: skip
     return {
-        f'options of {name}': describe.markdown([options.table_of(config)])
+        f'options of {name}': tables.markdown([options.table_of(config)])
         for name, config in configs.items()
     }
 

@@ -10,8 +10,8 @@ from typing import Any
 import gallery
 import numpy as np
 
-from trl_suite import describe
 from trl_suite.util import files
+from trl_suite.util.tables import markdown_table as table
 
 RUNS = pathlib.Path(__file__).resolve().parent / 'continual'
 # Action spaces (2017), supplement, table 4: normalised reward, mean ± standard deviation over 32
@@ -83,12 +83,6 @@ def tables() -> dict[str, dict[str, str]]:
             'transfer': transfer(),
         },
     }
-
-
-def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Returns a table whose cells are Markdown."""
-    found = [tuple(row) for row in rows]
-    return describe.markdown_table(describe.Table(tuple(header), found), plain=True)
 
 
 def figure(value: float) -> str:

@@ -19,6 +19,7 @@ from PIL import Image
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.describe import options
 from trl_suite.registry import build, catalogue
+from trl_suite.util import tables
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'docs'))
 import conf
@@ -305,13 +306,13 @@ class WordsTest(parameterized.TestCase):
         self.assertEqual(meanings['step_limit'][0], 400)
 
     def test_markdown(self):
-        table = describe.Table(('a', 'b'), [('x|y', 0.5), ('2 * <3>', 12)])
+        table = tables.Table(('a', 'b'), [('x|y', 0.5), ('2 * <3>', 12)])
         self.assertEqual(
-            describe.markdown(['a * b', table._replace(numbered=True)]),
+            tables.markdown(['a * b', table._replace(numbered=True)]),
             'a \\* b\n\n| index | a | b |\n| --: | --- | --: |\n'
             '| 0 | x\\|y | 0.5 |\n| 1 | 2 \\* &lt;3> | 12 |',
         )
-        self.assertEqual(describe.table(table.header, table.cells).split(), [
+        self.assertEqual(tables.table(table.header, table.cells).split(), [
             'a', 'b', 'x|y', '0.5', '2', '*', '<3>', '12',
         ])  # fmt: skip
 

@@ -39,7 +39,7 @@ import tqdm
 
 from trl_suite import evaluation, policies, suite
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
-from trl_suite.util import files
+from trl_suite.util import files, tables
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
@@ -137,7 +137,7 @@ def distance_table(names: dict[str, str], id_: str, results: Results, seeds: lis
             rows.append([name, *distances, f'{mean:.0f}', f'{speed:.1f}'])
     title = f'Distance to the first fall in `{id_}`, mean of {ACTION_EPISODES} episodes, m:'
     head = ['action', *(f'seed {seed}' for seed in seeds), 'mean', 'speed, m/s']
-    return f'{title}\n\n{pages.table(head, rows)}'
+    return f'{title}\n\n{tables.markdown_table(head, rows)}'
 
 
 def distance_panels(names: dict[str, str], results: Results) -> dict[str, dict[str, list[Any]]]:
@@ -209,7 +209,7 @@ def hierarchy_table(results: Results, seeds: list[int]) -> str:
                 minute = np.mean([last['survived_minute'] for last in done.values()])
                 rows.append([f'{task}, {kind}: {label}', *cells, f'{mean:.1f}', f'{minute:.0%}'])
     head = ['task', *(f'seed {seed}' for seed in seeds), 'mean', 'no fall in a minute']
-    return f'{HIERARCHY_EPISODES} episodes of 200 s:\n\n{pages.table(head, rows)}'
+    return f'{HIERARCHY_EPISODES} episodes of 200 s:\n\n{tables.markdown_table(head, rows)}'
 
 
 def hierarchy_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
@@ -272,7 +272,7 @@ def limit_table(results: Results, seeds: list[int]) -> str:
 
     title = f'Return divided by its maximum, mean over {LIMIT_EPISODES} episodes:'
     rows = ([limits, *(cell(model, limits) for model in MODELS)] for limits in LIMITS)
-    return f'{title}\n\n{pages.table(["torque limits", *MODELS], rows)}'
+    return f'{title}\n\n{tables.markdown_table(["torque limits", *MODELS], rows)}'
 
 
 def limit_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
@@ -338,7 +338,8 @@ def main() -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             files.write_json(found, path)
     seeds = sorted({int(key.rsplit('/', 1)[1]) for key in found['results']})
-    text = f'After {samples:g} samples, seeds {", ".join(map(str, seeds))}. '
+    unit = compared.axis.partition(',')[0]
+    text = f'After {samples:,.0f} {unit}, seeds {", ".join(map(str, seeds))}. '
     print(text := text + compared.table(found['results'], seeds))
     if arguments.picture is not None:
         pages.curves(arguments.picture, compared.panels(found['results']), compared.axis)

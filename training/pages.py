@@ -1,10 +1,10 @@
-"""Tables and pictures of results for the pages of the documentation."""
+"""Pictures of results for the pages of the documentation."""
 
 from __future__ import annotations
 
 import contextlib
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,6 @@ import numpy as np
 from trl_suite.util import files
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Returns a table as Markdown; all columns but the first are aligned to the right."""
-    head = list(head)
-    lines = [head, ['---', *['--:'] * (len(head) - 1)], *map(list, rows)]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
 @contextlib.contextmanager

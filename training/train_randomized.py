@@ -19,7 +19,6 @@ import argparse
 import pathlib
 from typing import Any
 
-import pages
 import ppo
 import runs
 import tqdm
@@ -28,7 +27,7 @@ from settings import RANDOMIZED, randomized_settings_for
 from train_all import SEED
 
 from trl_suite import evaluation, policies
-from trl_suite.util import errors, files
+from trl_suite.util import errors, files, tables
 from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
@@ -103,7 +102,7 @@ def table(entries: list[dict[str, Any]]) -> str:
                 f'{robot / none:.2f}', f'{none / shipped:.2f}',
             ])  # fmt: skip
     head = ['environment', 'policy', *CONDITIONS, 'robot / none', 'none / shipped']
-    return f'{text}\n\n{pages.table(head, rows)}'
+    return f'{text}\n\n{tables.markdown_table(head, rows)}'
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from trl_suite.benchmark.core import CORE, normalised
+from trl_suite.util import tables
 
 REPEATS = 2000  # bootstrap samples
 LEVELS = np.linspace(0, 1.2, 25)  # of performance profiles
@@ -158,20 +159,24 @@ def table(found: dict[str, Any]) -> str:
     title = f'{len(ids)} of {len(CORE)} environments, {found["budget"]:,} samples, 95 % confidence intervals'
     if found['left_out']:
         title += f'; left out, since some learners lack them: {", ".join(found["left_out"])}'
-    lines = [
-        title, '',
-        f'| learner | seeds | {" | ".join(AGGREGATES)} |', '|--|--:|' + '--|' * len(AGGREGATES),
-    ]  # fmt: skip
-    for learner, of in sorted(learners.items(), key=lambda item: -item[1]['iqm'][0]):
-        cells = [words(of[name], 3, several[learner]) for name in AGGREGATES]
-        lines.append(f'| {learner} | {len(of["seeds"])} | {" | ".join(cells)} |')
-    lines += ['', f'| environment | {" | ".join(learners)} |', '|--|' + '--:|' * len(learners)]
-    for id in ids:
-        means = [np.mean([run[-1] for run in of['scores'][id]]) for of in learners.values()]
-        lines.append(f'| `{id}` | {" | ".join(f"{mean:.3f}" for mean in means)} |')
-    if found['improvement']:
-        lines += ['', '| A, B | probability that A is better |', '|--|--|']
-    for pair, values in found['improvement'].items():
-        interval = any(several[learner] for learner in pair.split(', '))
-        lines.append(f'| {pair} | {words(values, 2, interval)} |')
-    return '\n'.join(lines)
+    ranking = [
+        (learner, len(of['seeds']), *(words(of[name], 3, several[learner]) for name in AGGREGATES))
+        for learner, of in sorted(learners.items(), key=lambda item: -item[1]['iqm'][0])
+    ]
+    means = [
+        (
+            f'`{id}`',
+            *(f'{np.mean([run[-1] for run in of["scores"][id]]):.3f}' for of in learners.values()),
+        )
+        for id in ids
+    ]
+    better = [
+        (pair, words(values, 2, any(several[learner] for learner in pair.split(', '))))
+        for pair, values in found['improvement'].items()
+    ]
+    return '\n\n'.join((
+        title,
+        tables.markdown_table(('learner', 'seeds', *AGGREGATES), ranking),
+        tables.markdown_table(('environment', *learners), means),
+        *([tables.markdown_table(('A, B', 'probability that A is better'), better)] if better else []),
+    ))  # fmt: skip

@@ -21,23 +21,12 @@ from trl_suite.describe.tasks import description_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.util import tables
-from trl_suite.util.tables import Section, Table, escape, markdown, markdown_table, table
+from trl_suite.util.tables import Section
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
-__all__ = [
-    'Section',
-    'Table',
-    'description_of',
-    'differences_of',
-    'escape',
-    'markdown',
-    'markdown_table',
-    'parts',
-    'sections',
-    'table',
-]
+__all__ = ['description_of', 'differences_of', 'parts', 'sections']
 
 
 def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str]]:

@@ -46,7 +46,7 @@ def text(parts: Iterable[Part]) -> str:
 def markdown(parts: Iterable[Part]) -> str:
     """Returns parts as Markdown, separated by empty lines."""
     return '\n\n'.join(
-        markdown_table(part) if isinstance(part, Table) else escape(part) for part in parts
+        _escaped(part) if isinstance(part, Table) else escape(part) for part in parts
     )
 
 
@@ -66,19 +66,19 @@ def table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str 
     )
 
 
-def markdown_table(table: Table, plain: bool = False) -> str:
-    """Returns a table as Markdown; cells that are `plain` Markdown, e.g. links, are not escaped."""
-    header, rows = list(table.header), [[_cell(c) for c in row] for row in table.cells]
-    if table.numbered:
-        header, rows = (
-            ['index', *header],
-            [[str(i), *row] for i, row in enumerate(rows)],
-        )
-    right = _numeric(list(zip(header, *rows, strict=True)))
-    if not plain:
-        rows = [list(map(escape, row)) for row in rows]
+def markdown_table(header: Iterable[str], cells: Iterable[Iterable[object]]) -> str:
+    """Returns a table whose cells are Markdown; columns of numbers are right-aligned."""
+    header, rows = list(header), [[_cell(c) for c in row] for row in cells]
+    right = _numeric(zip(header, *rows, strict=True))
     lines = [header, ['--:' if to_right else '---' for to_right in right], *rows]
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def _escaped(table: Table) -> str:
+    header, rows = list(table.header), [[escape(_cell(c)) for c in row] for row in table.cells]
+    if table.numbered:
+        header, rows = ['index', *header], [[str(i), *row] for i, row in enumerate(rows)]
+    return markdown_table(header, rows)
 
 
 def escape(text: str) -> str:
@@ -91,8 +91,8 @@ def _cell(value: object) -> str:
 
 
 def _numeric(columns: Iterable[Sequence[str]]) -> list[bool]:
-    """Returns which columns have only numbers below their titles."""
-    number = re.compile(r'([-+]?\d[-+.\de]*)?')
+    """Returns which columns have only numbers below their titles, or dashes for missing ones."""
+    number = re.compile(r'([-+]?\d[-+.\de%]*|–)?')
     return [all(number.fullmatch(cell) for cell in column[1:]) for column in columns]
 
 
