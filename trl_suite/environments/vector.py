@@ -21,7 +21,8 @@ from trl_suite import rendering
 from trl_suite.engine import BatchWorld, light_model
 from trl_suite.environments import arguments, states
 from trl_suite.environments.arguments import Ids
-from trl_suite.environments.environment import Core, Environment
+from trl_suite.environments.core import Core
+from trl_suite.environments.environment import Environment
 from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
@@ -65,7 +66,7 @@ class VectorEnvironment:
     In all methods, `env_ids` are indices of simulations, or a mask (n,) bool; None for all.
 
     Attributes:
-      core: the simulations, see `trl_suite.environments.environment.Core`.
+      core: the simulations, see `trl_suite.environments.core.Core`.
       num_envs: number of simulations n.
       seeds: seed of each simulation, (n,) uint32.
       at_limit: whether the last step reached the step or time limit, also if it failed, (n,) bool.

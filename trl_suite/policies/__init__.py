@@ -1,6 +1,7 @@
 """Trained policies as data: small networks in .npz files, evaluated with NumPy only."""
 
 from trl_suite.policies.convolution import Convolution
+from trl_suite.policies.ensemble import ensemble
 from trl_suite.policies.files import (
     SHARED,
     VARIANTS,
@@ -11,7 +12,7 @@ from trl_suite.policies.files import (
     save,
     trained_for,
 )
-from trl_suite.policies.network import ACTIVATIONS, Policy, ensemble, placed
+from trl_suite.policies.network import ACTIVATIONS, Policy, placed
 
 __all__ = [
     'ACTIVATIONS',

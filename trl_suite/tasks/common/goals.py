@@ -20,9 +20,9 @@ from trl_suite.bodies.spatial import SpatialState
 from trl_suite.bodies.state import FLAG, PLACE, REAL, WHOLE, allocated
 from trl_suite.engine import World
 from trl_suite.motion.layout import SPIN, VECTOR
+from trl_suite.tasks.body_task import BodyTask
 from trl_suite.tasks.rewards import Outcome, Term, give, terms_data
 from trl_suite.tasks.task import Marker, random_displacement
-from trl_suite.tasks.tracking import BodyTask
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline
 

@@ -18,6 +18,7 @@ from trl_suite.characters import Character
 from trl_suite.engine import GRAVITY, World
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
+from trl_suite.tasks.body_task import BodyTask
 from trl_suite.tasks.common.control import (
     GroundConfig,
     faces,
@@ -27,7 +28,6 @@ from trl_suite.tasks.common.control import (
     terrain_maps,
 )
 from trl_suite.tasks.rewards import Outcome, conclude
-from trl_suite.tasks.tracking import BodyTask
 from trl_suite.util.compiled import compiled
 
 FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
