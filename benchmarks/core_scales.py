@@ -2,8 +2,9 @@
 
     python benchmarks/core_scales.py [ID ...] [--episodes N]
 
-Episodes have seeds that no run uses. A change of the file needs another version of the format of
-results, in trl_suite/benchmark/core.py.
+Episodes have seeds that no run uses. A row names what its numbers depend on, the digest of the shipped
+policy included, and stays as it is when that policy is replaced: another number needs another version of
+the format of results, in trl_suite/benchmark/core.py.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from trl_suite import evaluation, policies, runs
 from trl_suite.benchmark import core
 from trl_suite.environments import named_policies
 from trl_suite.util import files, machine
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 SEED = 1_000_000  # of test seeds; runs have smaller ones
@@ -22,10 +24,14 @@ SEED = 1_000_000  # of test seeds; runs have smaller ones
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('ids', nargs='*', default=list(core.CORE), metavar='ID')
-    parser.add_argument('--episodes', type=int, default=1024)
+    parser.add_argument('--episodes', type=int, default=256)
     arguments = parser.parse_args()
     for id in arguments.ids:
-        course, row = core.BENCHMARK.get(id), {'episodes': arguments.episodes}
+        course = core.BENCHMARK.get(id)
+        row = {
+            'episodes': arguments.episodes, **machine.made_with(),
+            'policy': digest(policies.reference(id)),
+        }  # fmt: skip
         for name in ('zero', 'random', 'shipped'):
             baseline = named_policies.BASELINES.get(name)
             result = evaluation.evaluate(
@@ -39,8 +45,7 @@ def main() -> None:
         found = files.read_json(core.SCALES)['scores'] if core.SCALES.exists() else {}
         found[id] = row
         order = {id: found[id] for id in core.CORE if id in found}
-        made = {'format': core.BENCHMARK.format, **machine.made_with()}
-        files.write_json({**made, 'scores': order}, core.SCALES)
+        files.write_json({'format': core.BENCHMARK.format, 'scores': order}, core.SCALES)
 
 
 if __name__ == '__main__':

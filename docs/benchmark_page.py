@@ -3,8 +3,9 @@
     python docs/benchmark_page.py [--check]
 
 The scale of scores is in trl_suite/benchmark/scales.json; results are those of the entries in
-benchmarks/entries, which CI verifies. Curves and statistics go into docs/benchmark/report.json. With
---check nothing is written, and the exit status is 1 if a file is out of date. Needs
+benchmarks/entries, which CI verifies: an entry is a folder, whose name is that of its learner on the page.
+Curves and statistics go into docs/benchmark/report.json. With --check nothing is written, and the
+exit status is 1 if a file is out of date; a figure names the data that it shows. Needs
 `pip install 'trl_suite[video]'`.
 """
 
@@ -19,14 +20,17 @@ from typing import Any
 import numpy as np
 
 from trl_suite import benchmark
-from trl_suite.benchmark.report import LEVELS, report, table
+from trl_suite.benchmark.report import THRESHOLDS, report, table
 from trl_suite.util import files, tables
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 DOCS = pathlib.Path(__file__).resolve().parent
 PAGE, FOLDER = DOCS / 'benchmark.md', DOCS / 'benchmark'
 ENTRIES = DOCS.parent / 'benchmarks' / 'entries'
-BASELINES = ('ppo_learner:', 'stable_baselines_learners:', 'td3_learner:', 'tqc_learner:')
+BUDGET = benchmark.BUDGETS['1M']
+BASELINES = ('PPO', 'SAC', 'SuitePPO', 'TD3', 'TQC')  # the entries that are made here
+FIGURES = {'curves': 'report', 'environments': 'report', 'levels': 'levels'}  # and their data
 
 
 def core(found: dict[str, Any]) -> str:
@@ -35,12 +39,8 @@ def core(found: dict[str, Any]) -> str:
     rows = []
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
-        best = '–'
-        if id in found['environments']:
-            scores = [
-                np.mean([run[-1] for run in of['scores'][id]]) for of in found['learners'].values()
-            ]
-            best = f'{max(scores):.2f}'
+        scores = [np.mean(runs, 0)[-1] for of in every(found).values() if (runs := of.get(id))]
+        best = f'{max(scores):.2f}' if scores else '–'
         ends = f'{low:.3f}', f'{high:.3f}'
         rows.append((f'`{id}`', course.description, *ends, measured[id]['episodes'], best))
     header = 'environment', 'tests', '0 is', '1 is', 'episodes', 'best learner'
@@ -76,59 +76,61 @@ def levels() -> str:
     return f'{tables.markdown_table(header, rows)}\n\n{picture}'
 
 
-def entries() -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Returns the report of the learners with the most environments, and the results of the others.
+def entries() -> dict[str, Any]:
+    """Returns the report of the learners with the most environments.
 
-    A report counts only environments that are common to its learners.
+    A report counts only environments that are common to its learners, so that learners with fewer, or
+    others, are only in 'further': the scores of their runs after each part, (runs, 20), by learner and
+    environment.
+
+    Raises:
+      ValueError: an invalid result, or one with other settings than those of the benchmark.
     """
-    by_learner: dict[str, list[dict[str, Any]]] = {}
-    for path in sorted(ENTRIES.rglob('*.json')):
-        result = benchmark.read(path)
-        by_learner.setdefault(result['learner'], []).append(result)
-    count = {
-        learner: len({result['environment'] for result in results})
-        for learner, results in by_learner.items()
-    }
-    whole, others = [], []
-    for learner, results in by_learner.items():
-        (whole if count[learner] == max(count.values()) else others).extend(results)
-    return report(whole), others
+    results: dict[str, list[dict[str, Any]]] = {}
+    for folder in sorted(ENTRIES.iterdir()):
+        name = f'{folder.name} (baseline)' if folder.name in BASELINES else folder.name
+        for path in sorted(folder.glob('*.json')):
+            result = benchmark.read(path)
+            notes = benchmark.departures(result)
+            if result['budget'] != BUDGET:
+                notes.append(f'budget is {result["budget"]}, not {BUDGET}')
+            if notes:
+                raise ValueError(f'{path}: {"; ".join(notes)}')
+            results.setdefault(name, []).append({**result, 'learner': name})
+    ids = {name: {each['environment'] for each in of} for name, of in results.items()}
+    most = max(ids.values(), key=len)
+    found = report(each for name, of in results.items() if ids[name] == most for each in of)
+    further: dict[str, dict[str, list[list[float]]]] = {}
+    for name, of in results.items():
+        for each in of if ids[name] != most else ():
+            id = each['environment']
+            curve = [benchmark.normalised(id, score) for (score,) in each['scores']]
+            further.setdefault(name, {}).setdefault(id, []).append(curve)
+    return {**found, 'further': further}
 
 
-def curves_of(results: list[dict[str, Any]]) -> dict[str, dict[str, list[list[float]]]]:
-    """Returns the normalised scores of runs after each part, (runs, 20), by learner and environment."""
-    curves: dict[str, dict[str, list[list[float]]]] = {}
-    for result in results:
-        id = result['environment']
-        scores = [benchmark.normalised(id, score) for (score,) in result['scores']]
-        curves.setdefault(result['learner'], {}).setdefault(id, []).append(scores)
-    return curves
+def every(found: dict[str, Any]) -> dict[str, dict[str, list[list[float]]]]:
+    """Returns the curves of all learners by environment."""
+    return {name: of['scores'] for name, of in found['learners'].items()} | found['further']
 
 
-def further(results: list[dict[str, Any]]) -> str:
-    """Returns the table of results that are not in the report."""
-    rows = []
-    for learner, found in curves_of(results).items():
-        for id, runs in found.items():
-            score = np.mean([run[-1] for run in runs])
-            rows.append((f'`{id}`', learner, len(runs), f'{score:.3f}'))
-    return tables.markdown_table(('environment', 'learner', 'seeds', 'score'), rows)
-
-
-def leaderboard(found: dict[str, Any], others: list[dict[str, Any]]) -> str:
+def leaderboard(found: dict[str, Any]) -> str:
     """Returns tables and figures of all entries."""
-    title, ranking, rest = table(found).split('\n\n', 2)
-    for name in BASELINES:
-        ranking = ranking.replace(f'\n| {name}', f'\n| baseline: {name}')
+    header = 'environment', 'learner', 'seeds', 'score'
+    further = [
+        (f'`{id}`', learner, len(runs), f'{np.mean(runs, 0)[-1]:.3f}')
+        for learner, of in found['further'].items()
+        for id, runs in of.items()
+    ]
     return '\n\n'.join((
-        title, ranking, rest, *([further(others)] if others else []),
+        table(found), *([tables.markdown_table(header, further)] if further else []),
         '![Interquartile mean over samples, and the share of runs above each score](benchmark/curves.svg)',
         '![Scores in each environment over samples](benchmark/environments.svg)',
         'Curves and statistics: [report.json](benchmark/report.json).',
     ))  # fmt: skip
 
 
-def pictures(found: dict[str, Any], others: list[dict[str, Any]]) -> None:
+def pictures(found: dict[str, Any]) -> None:
     """Draws the curves, all together and of each environment, and the profiles."""
     import matplotlib
     from matplotlib import pyplot
@@ -137,34 +139,31 @@ def pictures(found: dict[str, Any], others: list[dict[str, Any]]) -> None:
     samples = np.array(found['samples']) / 1e6
     with matplotlib.rc_context(settings):  # the same file for the same data
         figure, (left, right) = pyplot.subplots(1, 2, figsize=(7, 2.8), layout='constrained')
-        for axes, name, x in ((left, 'curve', samples), (right, 'profile', LEVELS)):
+        for axes, name, x in ((left, 'curve', samples), (right, 'profile', THRESHOLDS)):
             for learner, of in found['learners'].items():
                 value, low, high = np.array(of[name]).T
-                axes.plot(x, value, label=learner.rpartition(':')[2])
+                axes.plot(x, value, label=learner)
                 axes.fill_between(x, low, high, alpha=0.2)
         left.set(xlabel='million samples', ylabel='interquartile mean of scores')
         right.set(xlabel='score', ylabel='share of runs above')
         left.legend()
-        _save(figure, FOLDER / 'curves.svg')
+        _save(figure, 'curves')
         rows = -(-len(found['environments']) // 4)
         figure, grid = pyplot.subplots(
             rows, 4, figsize=(8, 2 * rows), sharex=True, sharey=True, layout='constrained'
         )
         for axes in grid.flat[len(found['environments']) :]:
             axes.remove()
-        curves = {learner: of['scores'] for learner, of in found['learners'].items()}
-        curves |= curves_of(others)
         lines: dict[str, Any] = {}
         for axes, id in zip(grid.flat, found['environments'], strict=False):
-            for i, (learner, of) in enumerate(curves.items()):
+            for i, (learner, of) in enumerate(every(found).items()):
                 for run in of.get(id, ()):
                     axes.plot(samples, run, color=f'C{i}', alpha=0.3, linewidth=0.7)
                 if id in of:
-                    name = learner.rpartition(':')[2]
-                    (lines[name],) = axes.plot(samples, np.mean(of[id], 0), color=f'C{i}')
+                    (lines[learner],) = axes.plot(samples, np.mean(of[id], 0), color=f'C{i}')
             axes.set_title(id.removesuffix('-v0').replace('_Terrain', ''), fontsize=7)
         figure.legend(lines.values(), lines, loc='outside lower center', ncols=5)
-        _save(figure, FOLDER / 'environments.svg')
+        _save(figure, 'environments')
         of = files.read_json(FOLDER / 'levels.json')
         figure, axes = pyplot.subplots(
             1,
@@ -185,19 +184,25 @@ def pictures(found: dict[str, Any], others: list[dict[str, Any]]) -> None:
             each.set_title(id.removesuffix('-v0').replace('_Terrain', ''), fontsize=7)
         axes[0, 0].set(xlabel='levels', ylabel='mean return / step limit')
         axes[0, 0].legend(fontsize=7)
-        _save(figure, FOLDER / 'levels.svg')
+        _save(figure, 'levels')
 
 
-def _save(figure: Any, path: pathlib.Path) -> None:
-    with files.replacing(path) as part:
-        figure.savefig(part, metadata={'Date': None})
+def _save(figure: Any, name: str) -> None:
+    with files.replacing(FOLDER / f'{name}.svg') as part:
+        figure.savefig(part, metadata={'Date': None, 'Description': shown(name)})
 
 
-def page(found: dict[str, Any], others: list[dict[str, Any]], text: str) -> str:
+def shown(name: str) -> str:
+    """Returns what a figure shows: its data and their digest."""
+    data = FOLDER / f'{FIGURES[name]}.json'
+    return f'{data.name} {digest(rounded(files.read_json(data)))}'
+
+
+def page(found: dict[str, Any], text: str) -> str:
     """Returns the page with tables and figures."""
     for name, content in (
         ('core', core(found)),
-        ('leaderboard', leaderboard(found, others)),
+        ('leaderboard', leaderboard(found)),
         ('levels', levels()),
     ):
         text = files.between(text, name, 'docs/benchmark_page.py', f'\n{content}\n')
@@ -209,13 +214,14 @@ def main() -> None:
     parser.add_argument('--check', action='store_true', help='write nothing')
     arguments = parser.parse_args()
     stored = FOLDER / 'report.json'
-    found, others = entries()
+    found = entries()
     old = PAGE.read_text(encoding='utf-8')
-    new = page(found, others, old)
+    new = page(found, old)
     if arguments.check:
-        sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found))
+        drawn = all(shown(name) in (FOLDER / f'{name}.svg').read_text() for name in FIGURES)
+        sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found) or not drawn)
     files.write_json(found, stored)
-    pictures(found, others)
+    pictures(found)
     files.write_text(new, PAGE)
 
 

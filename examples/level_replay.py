@@ -52,7 +52,8 @@ def main():
     envs = SuiteVecEnv(given.environment, 16, seed=0, task_kwargs={'levels': (0, given.levels)})
     replay = Replay(envs, given.levels)
     PPO('MlpPolicy', VecMonitor(envs), n_steps=256, verbose=1).learn(given.steps, replay)
-    print('hardest levels:', *np.argsort(-replay.scores)[:10])
+    seen = np.flatnonzero(np.isfinite(replay.scores))
+    print('hardest levels:', *seen[np.argsort(-replay.scores[seen])][:10])
 
 
 if __name__ == '__main__':

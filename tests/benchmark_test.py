@@ -1,7 +1,8 @@
 """The benchmark: core set, verification, reports, and standard learners."""
 
-import contextlib
 import dataclasses
+import functools
+import importlib.util
 import json
 import pathlib
 import shutil
@@ -12,14 +13,23 @@ from unittest import mock
 import numpy as np
 from absl.testing import parameterized
 from helpers import FolderTest, assert_refused
-from programs import CommandTest
+from programs import CommandTest, run, run_example
 
 from trl_suite import benchmark, evaluation, policies, runs, suite
 from trl_suite.benchmark import core, report
 from trl_suite.runs import results, running
 from trl_suite.runs.course import Course
 
+ROOT = pathlib.Path(__file__).resolve().parents[1]
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
+
+
+def page():
+    """Imports the program that writes docs/benchmark.md."""
+    spec = importlib.util.spec_from_file_location('benchmark_page', ROOT / 'docs/benchmark_page.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 class CoreTest(parameterized.TestCase):
@@ -34,14 +44,14 @@ class CoreTest(parameterized.TestCase):
         made = json.loads(core.SCALES.read_text())
         self.assertEqual(made['format'], benchmark.BENCHMARK.format)
         self.assertEqual([*made['scores']], [*benchmark.CORE])
-        for id_, of in made['scores'].items():
-            low, high = benchmark.ends(id_)
-            self.assertEqual((low, high), (max(of['zero'], of['random']), of['shipped']))
-            self.assertLess(low + 0.1, high)
-            self.assertLessEqual(high, 1)
-            self.assertEqual(benchmark.normalised(id_, low), 0)
-            self.assertEqual(benchmark.normalised(id_, high), 1)
+        for of in made['scores'].values():
+            self.assertLess(max(of['zero'], of['random']) + 0.1, of['shipped'])
+            self.assertLessEqual(of['shipped'], 1)
             self.assertGreaterEqual(of['episodes'], 16)
+        of = {'zero': 0.1, 'random': 0.2, 'shipped': 0.7}
+        with mock.patch.object(core, 'scales', return_value={ID: of}):
+            self.assertAlmostEqual(benchmark.normalised(ID, 0.45), 0.5)
+            self.assertAlmostEqual(benchmark.normalised(ID, 0.1), -0.2)
 
     def test_step_limits(self):
         self.assertEqual(benchmark.get(ID).spec(ID).step_limit, 256)
@@ -168,6 +178,11 @@ class ReportTest(parameterized.TestCase):
         a, b = found['learners']['m:A'], found['learners']['m:B']
         self.assertEqual(found['environments'], self.IDS)
         self.assertEqual(found['left_out'], [[*benchmark.CORE][3]])
+        self.assertEqual(found['left_out_runs'], 0)
+        further = result_of('m:A', self.IDS[0], 4, 0.5)  # without a run of seed 4 in the other
+        more = report.report([*self.results(), further])
+        self.assertEqual((more['learners'], more['left_out_runs']), (found['learners'], 1))
+        self.assertIn('lacks the seed in others: 1 runs', report.table(more))
         self.assertEqual(found['samples'], [10 * (part + 1) for part in range(20)])
         self.assertAlmostEqual(a['iqm'][0], (0.3 + 0.4 + 0.5 + 0.6) / 4)
         self.assertAlmostEqual(a['median'][0], (1.0 / 4 + 3.3 / 4) / 2)
@@ -177,7 +192,7 @@ class ReportTest(parameterized.TestCase):
         self.assertLess(a['iqm'][1], a['iqm'][0])
         self.assertLess(a['iqm'][0], a['iqm'][2])
         np.testing.assert_allclose(np.array(a['curve'])[:, 0], 0.45 * np.arange(1, 21) / 20)
-        shares = dict(zip(report.LEVELS.round(2), np.array(a['profile'])[:, 0], strict=True))
+        shares = dict(zip(report.THRESHOLDS.round(2), np.array(a['profile'])[:, 0], strict=True))
         self.assertEqual((shares[0.0], shares[0.45], shares[1.2]), (1, 0.5, 0.125))
         self.assertAlmostEqual(found['improvement']['m:A, m:B'][0], (0.25 + 1) / 2)
         self.assertAlmostEqual(found['improvement']['m:B, m:A'][0], (0.75 + 0) / 2)
@@ -220,6 +235,50 @@ class ReportTest(parameterized.TestCase):
             report.report([])
 
 
+class PageTest(FolderTest):
+    """docs/benchmark_page.py: an entry is a folder, whose learner may have any name."""
+
+    def entries(self, **results):
+        """Returns the report of entries, lists of results by folder."""
+        program = page()
+        for name, each in results.items():
+            (self.folder / name).mkdir()
+            for i, result in enumerate(each):
+                (self.folder / name / f'{i}.json').write_text(json.dumps(result))
+        with (
+            mock.patch.object(program, 'ENTRIES', self.folder),
+            mock.patch.object(benchmark, 'read', lambda path: json.loads(path.read_text())),
+        ):
+            return program, program.entries()
+
+    def result(self, i, score, **changes):
+        id_ = [*benchmark.CORE][i]
+        return {**result_of('mine:Search', id_, 0, score), 'budget': 1_000_000, **changes}
+
+    def test_two_learners_of_one_name(self):
+        program, found = self.entries(
+            one=[self.result(0, 0.2), self.result(1, 0.3)], SAC=[self.result(0, 0.6)],
+            two=[self.result(0, 0.4), self.result(1, 0.5)], three=[self.result(2, 0.9)],
+        )  # fmt: skip
+        self.assertEqual([*found['learners']], ['one', 'two'])
+        self.assertEqual([*found['further']], ['SAC (baseline)', 'three'])
+        self.assertAlmostEqual(found['further']['three'][[*benchmark.CORE][2]][0][-1], 0.9)
+        text = program.leaderboard(found)
+        self.assertIn('| SAC (baseline) | 1 | 0.600 |', text)
+        self.assertLess(text.index('| two | 1 |'), text.index('| one | 1 |'))
+        best = [line.split(' | ')[-1] for line in program.core(found).splitlines()[2:6]]
+        self.assertEqual(best, ['0.60 |', '0.50 |', '0.90 |', '– |'])
+
+    @parameterized.parameters(
+        ({'budget': 10_000_000}, '0.json: budget is 10000000, not 1000000'),
+        ({'episodes': 1}, '0.json: episodes is 1, not 32'),
+        ({'seed': 9}, '0.json: seed is 9, not 0 or 1'),
+    )
+    def test_other_settings_are_refused(self, changes, message):
+        with self.assertRaisesRegex(ValueError, message):
+            self.entries(one=[self.result(0, 0.2, **changes)])
+
+
 class ReportCommandTest(CommandTest):
     def test_results_of_a_folder(self):
         learner = type('Nothing', (Shipped,), {'policy': lambda self: np.zeros_like})
@@ -244,6 +303,17 @@ class ReportCommandTest(CommandTest):
             path.write_text('{')  # of the learner, and of a killed process
         self.assertIn('a.json: ', self.output('benchmark', 'check', 'Nothing'))
         self.assert_refused('empty: has no results', 'benchmark', 'report', 'empty')
+        unfinished = json.loads((folder / 'a.json').read_text())
+        del unfinished['metrics']
+        unfinished['digest'] = results.digest(unfinished)
+        pathlib.Path('empty/b.json').write_text(json.dumps(unfinished))
+        for action in 'check', 'report', 'verify':
+            status, _, told = run('benchmark', action, 'empty')
+            self.assertEqual(status, 2)
+            self.assertIn('error: empty: no results of runs that have ended', told)
+        self.assert_refused(
+            "report.json: format is 'trl_suite report 1'", 'benchmark', 'check', 'report.json'
+        )
         self.assert_refused(
             "unknown environment of the benchmark 'PD_Gap'",
             'benchmark',
@@ -254,21 +324,28 @@ class ReportCommandTest(CommandTest):
         )
 
 
-with contextlib.suppress(ImportError):
-    sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+if importlib.util.find_spec('sb3_contrib'):
+    sys.path.insert(0, str(ROOT / 'examples'))
     import stable_baselines3
     import stable_baselines_export
     import stable_baselines_learners
     import td3_learner
     import torch
+    import tqc_learner
     from stable_baselines3.common.vec_env import VecNormalize
 
     from trl_suite.adapters.stable_baselines import SuiteVecEnv
 
+    class ShortPPO(stable_baselines_learners.PPO):
+        """An update after 5 steps of 8 simulations."""
+
+        kind = functools.partial(stable_baselines3.PPO, n_steps=5, batch_size=8)
+
     class StableBaselinesTest(FolderTest):
         @parameterized.parameters(
-            stable_baselines_learners.PPO, stable_baselines_learners.SAC, td3_learner.TD3
-        )
+            stable_baselines_learners.PPO, stable_baselines_learners.SAC, td3_learner.TD3,
+            tqc_learner.TQC,
+        )  # fmt: skip
         def test_exported_policies_are_those_of_the_library(self, kind):
             learner = kind(benchmark.get(ID), 0)
             policy = learner.policy()
@@ -312,7 +389,9 @@ with contextlib.suppress(ImportError):
             expected, _ = model.predict(scaled.normalize_obs(observations), deterministic=True)
             np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
 
-        @parameterized.parameters(stable_baselines_learners.SAC, td3_learner.TD3)
+        @parameterized.parameters(
+            ShortPPO, stable_baselines_learners.SAC, td3_learner.TD3, tqc_learner.TQC
+        )
         def test_a_stopped_run_resumes_exactly(self, kind):
             def measured(cases, *_, executor):
                 for _, policy in cases:
@@ -334,3 +413,10 @@ with contextlib.suppress(ImportError):
             for name in ('scores', 'samples', 'curves', 'policy'):
                 self.assertEqual(parts[name], whole[name], name)
             self.assertNotEqual(whole['scores'][-1], whole['scores'][0])
+
+    class ExampleTest(CommandTest):
+        def test_levels_are_replayed(self):
+            out = run_example('level_replay', '--levels', '40', '--steps', '4096')
+            hardest = [int(level) for level in out.splitlines()[-1].split(':')[1].split()]
+            self.assertLen(set(hardest), 10)
+            self.assertContainsSubset(hardest, range(40))

@@ -5,7 +5,6 @@ import importlib.util
 import math
 import pathlib
 import re
-import runpy
 import sys
 import unittest
 from unittest import mock
@@ -14,14 +13,12 @@ import gymnasium
 import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
-from programs import CommandTest, output
+from programs import EXAMPLES, CommandTest, output, run_example
 
 import trl_suite.gym
 from trl_suite import sequences, suite
-from trl_suite.util import program
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-EXAMPLES = ROOT / 'examples'
 FLAT, GAPS = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0'
 
 
@@ -30,14 +27,6 @@ def needs(module, extra):
     return unittest.skipUnless(
         importlib.util.find_spec(module), f"needs {module}: pip install 'trl_suite[{extra}]'"
     )
-
-
-def run_example(name, *arguments):
-    """Runs an example as a program in this process; returns what it printed."""
-    with mock.patch.object(program, 'begin_script'):  # it is for processes of their own
-        return output(
-            lambda: runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__'), *arguments
-        )
 
 
 def run_page(word):

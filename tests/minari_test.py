@@ -14,9 +14,11 @@ if importlib.util.find_spec('minari') is None:
 
 import minari
 from helpers import assert_uniform
-from programs import CommandTest
+from programs import CommandTest, run_example
 
+from trl_suite import policies
 from trl_suite.adapters import minari as adapter
+from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_Flat-v0'
@@ -75,9 +77,19 @@ class DataSetTest(CommandTest):
         recipe = json.loads(json.loads(first['metadata.json'])['description'])
         self.assertEqual((recipe['policy'], recipe['episodes'], recipe['seed']), ('mixed', 3, 0))
         self.assertLen(recipe['sha256'], 64)
+        self.assertEqual(recipe['numpy'], np.__version__)
+        self.assertEqual(recipe['weights'], digest(policies.reference(ID)))
         self.enter('c')
         adapter.write(ID, 'mixed', 3, seed=1)
         self.assertNotEqual(self.contents('c', name)['main_data.hdf5'], first['main_data.hdf5'])
+
+    @unittest.skipUnless(importlib.util.find_spec('torch'), 'needs torch')
+    def test_a_policy_is_cloned(self):
+        name = adapter.write(ID, 'reference', 2, num_threads=1)
+        out = run_example('behaviour_cloning', name, '--epochs', '3', '--episodes', '1')
+        errors = [float(line.split()[-1]) for line in out.splitlines()[:-1]]
+        self.assertLess(errors[-1], 0.7 * errors[0])
+        self.assertRegex(out, r'\nreturn \d+\.\d of 256\n$')
 
     def test_refusals(self):
         name = adapter.write(ID, 'random', 1)

@@ -3,6 +3,8 @@
 import contextlib
 import io
 import itertools
+import pathlib
+import runpy
 import sys
 from unittest import mock
 
@@ -10,7 +12,9 @@ import numpy as np
 from helpers import FolderTest
 
 from trl_suite import cli, policies, suite
+from trl_suite.util import program
 
+EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 
 
@@ -34,6 +38,14 @@ def output(function, *arguments):
     ):
         function()
     return out.getvalue()
+
+
+def run_example(name, *arguments):
+    """Runs an example as a program in this process; returns what it printed."""
+    with mock.patch.object(program, 'begin_script'):  # it is for processes of their own
+        return output(
+            lambda: runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__'), *arguments
+        )
 
 
 class CommandTest(FolderTest):

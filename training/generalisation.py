@@ -31,11 +31,11 @@ RUNS = dataclasses.replace(
 )
 
 
-def measured(id_, count, seed, budget, folder):
+def measured(id_, count, seed, folder):
     """Trains a policy, and returns its scores on the levels of training and on others."""
     path = folder / f'{id_}_{count}_s{seed}.json'
     learner = SuitePPO(RUNS.get(id_), seed, task_kwargs={'levels': (0, count)})
-    RUNS.run(id_, learner, budget, path, seed=seed, num_threads=1)
+    RUNS.run(id_, learner, benchmark.BUDGETS['1M'], path, seed=seed, num_threads=1)
     policy = policies.load(path.with_suffix('.npz'))
     results = [
         evaluation.evaluate(id_, policy, EPISODES, 0, 1, {'levels': levels})
@@ -48,7 +48,6 @@ def main():
     """Measures what levels.json lacks."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--output', type=pathlib.Path, required=True, help='folder of the runs')
-    parser.add_argument('--budget', type=float, default=1e6, help='samples of each run')
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     found = files.read_json(FILE) if FILE.exists() else {}
@@ -57,7 +56,7 @@ def main():
             for count in COUNTS:
                 scores = found.setdefault(id_, {}).setdefault(str(count), [])
                 if len(scores) == seed:
-                    scores.append(measured(id_, count, seed, arguments.budget, arguments.output))
+                    scores.append(measured(id_, count, seed, arguments.output))
                     files.write_json(found, FILE)
 
 

@@ -30,6 +30,7 @@ from trl_suite.environments import named_policies
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.util import errors, machine
+from trl_suite.util.digest import digest
 from trl_suite.util.options import checked
 
 try:
@@ -93,7 +94,10 @@ def write(id: str, policy: str, episodes: int, seed: int = 0, num_threads: int =
     recipe = {
         'id': id, 'policy': policy, 'episodes': episodes, 'seed': seed,
         'trl_suite': trl_suite.__version__, **machine.made_with(),
+        **{name: machine.version(name) for name in ('numpy', 'h5py', 'minari')},
     }  # fmt: skip
+    if policy != 'random':
+        recipe['weights'] = digest(policies.reference(id))
     recipe['sha256'] = hashlib.sha256(json.dumps(recipe).encode()).hexdigest()
     stem, _, version = id.rpartition('-')
     name = f'{stem}-{policy}-{version}'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
+from typing import Any
 
 import numpy as np
 
@@ -39,10 +40,11 @@ CORE: dict[str, Course] = {
 
 
 @functools.cache
-def scales() -> dict[str, dict[str, float]]:
-    """Returns measured scores of each environment: 'zero', 'random' and 'shipped'.
+def scales() -> dict[str, dict[str, Any]]:
+    """Returns measured scores of each environment: 'zero', 'random' and 'shipped', and 'episodes' of each.
 
-    `benchmarks/core_scales.py` measures them; the format of results has their version.
+    `benchmarks/core_scales.py` measures them, and names engine, CPU and policy; the format of results has
+    their version.
     """
     return files.read_json(SCALES)['scores']
 

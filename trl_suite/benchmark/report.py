@@ -18,7 +18,7 @@ from trl_suite.benchmark.core import CORE, normalised
 from trl_suite.util import tables
 
 REPEATS = 2000  # bootstrap samples
-LEVELS = np.linspace(0, 1.2, 25)  # of performance profiles
+THRESHOLDS = np.linspace(0, 1.2, 25)  # of performance profiles
 
 # Of normalised scores (..., runs, environments).
 AGGREGATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -40,11 +40,12 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
       results: complete results of one budget.
 
     Returns:
-      * 'budget', 'environments', 'left_out', those that only some learners have, and 'samples' of the
-        points of curves, (20,).
+      * 'format', 'budget', 'environments', and 'samples' of the points of curves, (20,).
+      * 'left_out': environments that only some learners have; 'left_out_runs': number of results of the
+        others, with seeds that their learner lacks in one of them.
       * 'learners': by name 'seeds'; 'scores', by environment those after each part of each run, (runs,
         20); the estimates `AGGREGATES` after the run; 'curve', the interquartile mean after each
-        part, (20, 3); 'profile', the share of runs with a score above each of `LEVELS`, (25, 3).
+        part, (20, 3); 'profile', the share of runs with a score above each of `THRESHOLDS`, (25, 3).
       * 'improvement': for pairs of learners 'A, B' the probability that a run of A has a higher score
         than one of B in the same environment.
 
@@ -79,11 +80,12 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
     ids = [id for id in CORE if count[id] == len(found)]
     if not ids:
         raise ValueError(f'no environment is common to the learners {", ".join(found)}')
-    curves, learners = {}, {}
+    curves, learners, left_out_runs = {}, {}, 0
     for learner, runs in sorted(found.items()):
         seeds = sorted(set.intersection(*({s for i, s in runs if i == id} for id in ids)))
         if not seeds:
             raise ValueError(f'{learner}: no seed is common to {", ".join(ids)}')
+        left_out_runs += sum(id in ids and seed not in seeds for id, seed in runs)
         own = np.array([
             [[normalised(id, score) for (score,) in runs[id, seed]['scores']] for id in ids]
             for seed in seeds
@@ -97,9 +99,11 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
     budget = everything[0]['budget']
     parts = len(everything[0]['scores'])
     return {
+        'format': 'trl_suite report 1',  # other files of a folder are results
         'budget': budget,
         'environments': ids,
         'left_out': [id for id in CORE if 0 < count[id] < len(found)],
+        'left_out_runs': left_out_runs,
         'samples': [budget * (part + 1) // parts for part in range(parts)],
         'learners': learners,
         'improvement': {
@@ -133,7 +137,7 @@ def _interval(values: np.ndarray) -> list[Any]:
 def _estimates(scores: np.ndarray) -> dict[str, Any]:
     samples = np.moveaxis(_samples(scores), -1, 1)  # (1 + REPEATS, parts, runs, environments)
     last = samples[:, -1]
-    profile = np.stack([(last > level).mean((-2, -1)) for level in LEVELS], -1)
+    profile = np.stack([(last > level).mean((-2, -1)) for level in THRESHOLDS], -1)
     return {
         **{name: _interval(function(last)) for name, function in AGGREGATES.items()},
         'curve': _interval(AGGREGATES['iqm'](samples)),
@@ -159,6 +163,8 @@ def table(found: dict[str, Any]) -> str:
     title = f'{len(ids)} of {len(CORE)} environments, {found["budget"]:,} samples, 95 % confidence intervals'
     if found['left_out']:
         title += f'; left out, since some learners lack them: {", ".join(found["left_out"])}'
+    if found['left_out_runs']:
+        title += f'; left out, since their learner lacks the seed in others: {found["left_out_runs"]} runs'
     ranking = [
         (learner, len(of['seeds']), *(words(of[name], 3, several[learner]) for name in AGGREGATES))
         for learner, of in sorted(learners.items(), key=lambda item: -item[1]['iqm'][0])

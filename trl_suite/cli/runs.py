@@ -88,7 +88,7 @@ def _results(entries: list[pathlib.Path]) -> list[pathlib.Path]:
         found = sorted(entry.rglob('*.json')) if entry.is_dir() else [files.existing(entry)]
         found = [path for path in found if not _is_state(path.relative_to(entry))]
         if not found:
-            raise ValueError(f'{entry}: has no results; expected files ENVIRONMENT_sSEED.json')
+            raise ValueError(f'{entry}: has no results; expected .json files of runs')
         paths += found
     return paths
 
@@ -99,14 +99,22 @@ def _is_state(path: pathlib.Path) -> bool:
 
 
 def _read(benchmark: Any, entries: list[pathlib.Path]) -> Iterator[tuple[pathlib.Path, Any]]:
-    """Yields path and content of results; unfinished ones in folders are left out, with a note."""
+    """Yields path and content of results; unfinished ones in folders are left out, with a note.
+
+    Raises:
+      ValueError: an invalid result, or none of a run that has ended.
+    """
+    ended = False
     for path in _results(entries):
         result = benchmark.read(path, complete=path in entries)
         if 'metrics' in result:
+            ended = True
             yield path, result
         else:
             note = f'trl-suite: {path} is left out, since its run has not ended'
             print(program.printable(note), file=sys.stderr, flush=True)
+    if not ended:
+        raise ValueError(f'{", ".join(map(str, entries))}: no results of runs that have ended')
 
 
 @contextlib.contextmanager
@@ -188,14 +196,18 @@ def _check(arguments: argparse.Namespace) -> None:
     """Checks results, and prints one line for each."""
     benchmark = engine.load(f'trl_suite.{arguments.benchmark}').BENCHMARK
     for path, result in _read(benchmark, arguments.entries):
-        notes = benchmark.departures(result)
-        comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
         made = ''.join(f', {name} {result[name]}' for name in ('mujoco', 'cpu') if name in result)
         line = (
             f'{path}: {result["learner"]}, {result[benchmark.field]}, budget {result["budget"]}, '
-            f'seed {result["seed"]}{made}: {comparable}'
+            f'seed {result["seed"]}{made}: {_comparable(benchmark, result)}'
         )
         print(program.printable(line))
+
+
+def _comparable(benchmark: Any, result: dict[str, Any]) -> str:
+    """Returns whether a result has the settings of the benchmark, in words."""
+    notes = benchmark.departures(result)
+    return f'not comparable: {"; ".join(notes)}' if notes else 'comparable'
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -214,7 +226,7 @@ def _verify(arguments: argparse.Namespace) -> None:
         result, allowed = benchmark.verify(path, arguments.threads)
         how = 'bit for bit' if not allowed else f'within {allowed}'
         mujoco, cpu = (result.get(name, 'unknown') for name in ('mujoco', 'cpu'))
-        score = f'score {result["metrics"]["score"]:.3f}'
+        score = f'score {result["metrics"]["score"]:.3f}, {_comparable(benchmark, result)}'
         print(
             program.printable(
                 f'{path}: verified {how} (made with MuJoCo {mujoco} on {cpu}), {score}'

@@ -141,8 +141,10 @@ class Benchmark(results.Format):
         with files.locked(path.with_name(f'.{path.name}.lock'), what):
             if path.exists():
                 result = self._resumed(path, result, learner, count)
-                if progress and len(result['scores']) >= stages:
-                    print(f'{path} is finished; remove it to run again', file=sys.stderr)
+                done = len(result['scores'])
+                if progress and done >= stages:
+                    note = f'{path} holds {done} of {count} stages; remove it to run again'
+                    print(note, file=sys.stderr)
             else:
                 # Else a folder or a policy of the user would be removed.
                 for own in (path.with_suffix('.npz'), *(_state(path, n) for n in range(1, count))):
@@ -250,7 +252,10 @@ class Benchmark(results.Format):
         same = all(result.get(name) == value for name, value in machine.made_with().items())
         allowed = 0.0 if same else TOLERANCE
         if not np.allclose(again, result['scores'][-1], rtol=0, atol=allowed):
-            raise ValueError(f'{path}: scores[-1] is {result["scores"][-1]}; measured {again}')
+            raise ValueError(
+                f'{path}: scores[-1] is {result["scores"][-1]}; measured {again}; expected '
+                + (f'a difference of at most {allowed}' if allowed else 'no difference')
+            )
         return result, allowed
 
     def _resumed(
