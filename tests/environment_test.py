@@ -14,7 +14,7 @@ import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
-from dm_env import test_utils
+from dm_env import specs, test_utils
 from helpers import (
     KINDS,
     advance,
@@ -26,6 +26,7 @@ from helpers import (
 
 from trl_suite import characters, describe, motion, policies, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
+from trl_suite.environments import vector
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks import parts
 from trl_suite.vector import VectorEnvironment
@@ -468,8 +469,56 @@ class HookTest(parameterized.TestCase):
         environment.reset()
         environment.step(np.zeros(6))
         self.assertEqual(calls, ['reset', 'after_step'])
+        for name in 'initialize_episode_mjcf', 'after_compile':
+            with self.assertRaisesRegex(
+                ValueError, f'{name} hook: the model is compiled once.*before_step'
+            ):
+                environment.add_extra_hook(name, print)
 
-    def test_an_entity_with_substep_hooks_is_rejected(self):
+    def test_methods_of_a_task(self):
+        """They are called, or refused; a vector environment calls none."""
+        calls = []
+
+        def after_step(task, physics, random_state):
+            super(type(task), task).after_step(physics, random_state)
+            calls.append(float(task.reward[0]))
+
+        task = self.task(after_step=after_step)
+        environment = Environment(task, random=0)
+        environment.reset()
+        self.assertEqual([environment.step(np.zeros(6)).reward], calls)
+        for name in 'get_reward', 'get_discount', 'should_terminate_episode':
+            with self.assertRaisesRegex(ValueError, f'overrides {name}.*finish_step'):
+                Environment(self.task(**{name: lambda self, physics: 1.0}))
+        with self.assertRaisesRegex(ValueError, 'initialize_episode_mjcf hook'):
+            Environment(self.task(initialize_episode_mjcf=lambda self, random_state: None))
+
+        def made(spec, options):
+            return self.task(after_step=after_step)
+
+        with (
+            mock.patch.object(vector, 'build_task', made),
+            self.assertRaisesRegex(ValueError, 'a hook after_step, which only a single'),
+        ):
+            VectorEnvironment('PD_Biped2D_Flat-v0', 2)
+
+    def test_an_entity_places_itself(self):
+        """Physics are consistent after it has changed its state at the beginning of an episode."""
+
+        def place(prop, physics, random_state):
+            physics.bind(prop.joint).qpos = 3, 0, 7, 1, 0, 0, 0
+
+        ball, task = self.prop(initialize_episode=place), self.task()
+        ball.joint = task.arena.attach(ball).add('freejoint')
+        ball.mjcf_model.worldbody.add('geom', size=[0.1])
+        environment = Environment(task, random=0)
+        environment.reset()
+        data = environment.physics.data
+        self.assertAlmostEqual(data.geom_xpos[-1, 2], 7)
+
+    def prop(self, **methods):
+        """An entity with other methods."""
+
         class Prop(composer.Entity):
             def _build(self):
                 self._root = mjcf.RootElement('prop')
@@ -478,13 +527,40 @@ class HookTest(parameterized.TestCase):
             def mjcf_model(self):
                 return self._root
 
-            def after_substep(self, physics, random_state):
-                physics.step()
+        return type('Own', (Prop,), methods)()
 
+    def test_an_entity_with_substep_hooks_is_rejected(self):
         task = self.task()
-        task.arena.attach(Prop())
+        task.arena.attach(self.prop(after_substep=lambda self, physics, random_state: None))
         with self.assertRaisesRegex(ValueError, 'after_substep hook'):
             Environment(task)
+
+
+class DmEnvTest(absltest.TestCase):
+    def test_the_action_of_a_reset_is_ignored(self):
+        environment = suite.make(GAPS, {'random': 0, 'step_limit': 1})
+        self.assertTrue(environment.step(None).first())
+        environment.step(np.zeros(11))
+        self.assertTrue(environment.at_limit)
+        ended = environment.get_state()
+        self.assertTrue(environment.step(np.full(11, np.nan)).first())
+        self.assertFalse(environment.at_limit)
+        environment.set_state(ended)
+        self.assertEqual((environment.at_limit, environment.ending), (True, 'truncated'))
+
+    def test_observables_of_users(self):
+        """They keep their type and bounds."""
+        task = HookTest().task()
+        camera = observable.MJCFCamera(
+            task.arena.mjcf_model.worldbody.add('camera', pos=[0, -4, 2]), 8, 12
+        )
+        camera.enabled = True
+        task.task_observables['view'] = camera
+        environment = Environment(task, random=0)
+        view = environment.reset().observation['view']
+        self.assertEqual((view.shape, view.dtype), ((8, 12, 3), np.uint8))
+        environment.observation_spec()['view'].validate(view)
+        self.assertIsInstance(environment.observation_spec()['view'], specs.BoundedArray)
 
 
 class ConstructionTest(parameterized.TestCase):

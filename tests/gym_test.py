@@ -222,9 +222,8 @@ class SingleTest(Same, parameterized.TestCase):
         idle = np.zeros(6)
         with self.assertRaises(gymnasium.error.ResetNeeded):
             env.step(idle)
-        for seed in (-1, 2**32):
-            with self.assertRaisesRegex(ValueError, 'seed'):
-                env.reset(seed=seed)
+        with self.assertRaisesRegex(ValueError, 'seed'):
+            env.reset(seed=-1)
         env.reset(seed=np.int64(3))
         with self.assertRaises(ValueError):
             env.step(np.zeros(5))
@@ -289,7 +288,8 @@ class VectorTest(Same, parameterized.TestCase):
             if ended.any():
                 # Gymnasium's takes the mask out of the dict.
                 options = [{'reset_mask': ended.copy()} for _ in range(2)]
-                seed = [100 + step] * 3 if step % 2 else None  # of the simulations that are reset
+                # Of the simulations that are reset.
+                seed = [100 + step, None, step] if step % 2 else None
                 self.assert_same(
                     ours.reset(seed=seed, options=options[0]),
                     theirs.reset(seed=seed, options=options[1]),
@@ -410,7 +410,7 @@ class VectorTest(Same, parameterized.TestCase):
         masks = ([True], np.array([1, 0]), np.zeros(2, bool), 'no')
         assert_refused(
             self,
-            *((lambda s=s: envs.reset(seed=s), 'seed') for s in ([1], [1, None], [-1, 2], [0.5, 1.5], -1)),
+            *((lambda s=s: envs.reset(seed=s), 'seed') for s in ([1], [None], [None, -1], [-1, 2], [0.5, 1.5], -1)),
             *((lambda m=m: envs.reset(options={'reset_mask': m}), 'reset_mask') for m in masks),
             (lambda: envs.reset(options={'levl': 3}), "unknown option of reset 'levl'; did you mean 'level'"),
             (lambda: SuiteEnv(FLAT).reset(options={'reset_mask': 1}), "unknown option of reset 'reset_mask'"),

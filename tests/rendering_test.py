@@ -634,7 +634,9 @@ except RuntimeError as error:
         (DM_CONTROL_FIRST, {}, 'True'),
         (NO_EGL, {}, 'cannot render: .* MUJOCO_GL is not set'),
         (f'{DM_CONTROL_FIRST}; {NO_EGL}', {}, 'cannot render: .* MUJOCO_GL is not set'),
-        (DM_CONTROL_FIRST, NO_DRIVER, "cannot render: .* MUJOCO_GL is 'egl'"),
+        ('', NO_DRIVER, 'cannot render: .* MUJOCO_GL is not set'),
+        (DM_CONTROL_FIRST, NO_DRIVER, 'cannot render: .* MUJOCO_GL is not set'),
+        ('', {'PYOPENGL_PLATFORM': 'osmesa'}, 'cannot render: .* MUJOCO_GL is not set'),
     )
     def test_without_a_display(self, first, variables, expected):
         program = f"""

@@ -89,8 +89,17 @@ class StableBaselinesTest(parameterized.TestCase):
         seen = np.concatenate([first(seed) for seed in (3, 4, 2**32 - 1)])
         self.assertLen(np.unique(seen, axis=0), 24)
 
+    def test_options_choose_levels(self):
+        envs = SuiteVecEnv(GAPS, 3, 1, seed=0, task_kwargs={'levels': (0, 1000)})
+        envs.set_options([{'level': 7}, {}, {'level': 9}])
+        envs.reset()
+        self.assertEqual(envs.environment.level[[0, 2]].tolist(), [7, 9])
+        envs.reset()
+        self.assertNotEqual(envs.environment.level[[0, 2]].tolist(), [7, 9])
+
     def test_render(self):
         envs = SuiteVecEnv(FLAT, 3, 1, seed=0, render_mode='rgb_array', render_kwargs=SMALL)
+        self.assertEqual(envs.metadata['render_fps'], 30)
         envs.reset()
         picture = envs.render()
         self.assertEqual(picture.shape, (96, 128, 3))  # two by two, the last one empty

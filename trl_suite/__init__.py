@@ -7,17 +7,37 @@ time_step = environment.reset()
 """
 
 import contextlib
+import ctypes
 import ctypes.util
 import importlib
 import os
 import sys
 from typing import Any
 
+
+def _egl_devices() -> int:
+    """Returns the number of devices on which EGL could render: 0 without the library, or a driver."""
+    library = ctypes.util.find_library('EGL')
+    try:
+        find = ctypes.CDLL(library).eglGetProcAddress if library else None
+    except (OSError, AttributeError):
+        find = None
+    if find is None:
+        return 0
+    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    if (address := find(b'eglQueryDevicesEXT')) is None:
+        return 0
+    count = ctypes.c_int32()
+    query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
+    return count.value if query(address)(0, None, ctypes.byref(count)) else 0
+
+
 if (
     sys.platform == 'linux'
     and not os.environ.get('MUJOCO_GL')
     and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
-    and ctypes.util.find_library('EGL')  # without this library, importing dm_control would fail
+    and os.environ.get('PYOPENGL_PLATFORM', 'egl') == 'egl'
+    and _egl_devices()  # without one, as in a container without a driver, importing dm_control would fail
 ):
     # dm_control would choose GLFW, which cannot render without a display. This creates no context.
     os.environ['MUJOCO_GL'] = 'egl'

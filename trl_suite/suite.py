@@ -65,7 +65,7 @@ def load(
     errors.check_known('domain', TASKS_BY_DOMAIN, domain_name)
     errors.check_known(f'task of domain {domain_name!r}', TASKS_BY_DOMAIN[domain_name], task_name)
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
-    environment_kwargs.setdefault('visualize_reward', visualize_reward)
+    environment_kwargs['visualize_reward'] = visualize_reward
     spec = catalogue.BY_TASK[domain_name, task_name]
     return build_environment(spec, task_kwargs, environment_kwargs)
 

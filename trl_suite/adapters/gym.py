@@ -100,19 +100,23 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         )
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Starts an episode, seeded if `seed`, in [0, 2**32), is given.
+        """Starts an episode, seeded if `seed` is given; one of 2**32 or more is hashed.
 
         `options` may have the 'level' of the environment's `reset`.
         """
         errors.check_known('option of reset', ('level',), *(options or {}))
         level = (options or {}).get('level')
+        stream: Any = seed
         if seed is not None:
-            arguments.check_seed('seed', seed)
+            if arguments.is_integer(seed) and seed >= 2**32:
+                (stream,) = np.random.SeedSequence(seed).generate_state(1).tolist()
+            arguments.check_seed('seed', stream)
             seed = int(seed)
         if level is not None:
             self.environment.task.choose_level([0], level)
         if seed is not None:  # after all checks
-            self.environment.random_state.seed(seed)
+            self.environment.random_state.seed(stream)
+            self.environment.core.seeds[0] = stream
         super().reset(seed=seed)
         time_step = self.environment.reset()
         return self._observation(time_step.observation), flat(self.environment.info)
@@ -192,11 +196,12 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
     ) -> tuple[Any, Info]:
         """Starts episodes in all simulations, or in those of `options['reset_mask']`.
 
-        They are seeded if `seed` is given. `options` may have the 'level' of the environment's `reset`.
+        They are seeded if `seed` is given, except where it is None. `options` may have the 'level' of the
+        environment's `reset`.
         """
         errors.check_known('option of reset', ('level', 'reset_mask'), *(options or {}))
         env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
@@ -204,7 +209,12 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(
                 f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
             )
-        observation = self.environment.reset(env_ids, seed, (options or {}).get('level'))
+        if isinstance(seed, (list, tuple)) and None in seed:
+            seeds = arguments.all_seeds([each or 0 for each in seed], self.num_envs).tolist()
+            self.environment.seed(seeds, env_ids & np.array([each is not None for each in seed]))
+            seed = None
+        known: Any = seed
+        observation = self.environment.reset(env_ids, known, (options or {}).get('level'))
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         return observation, masked(flat(self.environment.info), env_ids)
 

@@ -107,10 +107,13 @@ def write(id: str, policy: str, episodes: int, seed: int = 0, num_threads: int =
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='.trl_suite_', dir=path.parent) as folder:
-        with mock.patch.dict(os.environ, {FOLDER: folder}), warnings.catch_warnings():
+        with (
+            mock.patch.dict(os.environ, {FOLDER: folder}), warnings.catch_warnings(),
+            gymnasium.make(f'trl_suite/{id}') as env,
+        ):  # fmt: skip
             warnings.simplefilter('ignore', UserWarning)  # of fields without a value
             minari.create_dataset_from_buffers(
-                name, _recorded(id, POLICIES[policy], seeds, num_threads), gymnasium.make(f'trl_suite/{id}'),
+                name, _recorded(id, POLICIES[policy], seeds, num_threads), env,
                 algorithm_name=policy, description=json.dumps(recipe),
             )  # fmt: skip
         os.rename(pathlib.Path(folder) / name, path)

@@ -71,6 +71,7 @@ class SuiteVecEnv(VecEnv):
             environment, render_mode=render_mode, render_kwargs=render_kwargs
         )
         super().__init__(view.num_envs, view.single_observation_space, view.single_action_space)
+        self.metadata = view.metadata
 
     def seed(self, seed: int | None = None) -> list[int]:
         """Sets the seeds for the next reset; they are derived from one as in the constructor.
@@ -83,8 +84,11 @@ class SuiteVecEnv(VecEnv):
         return seeds
 
     def reset(self) -> Any:
-        """Starts an episode in every simulation; options of `set_options` are ignored."""
+        """Starts an episode in every simulation; `set_options` may have set its 'level'."""
         seeds = [seed for seed in self._seeds if seed is not None] or None
+        for env_id, options in enumerate(self._options):
+            if (level := options.get('level')) is not None:
+                self.environment.task.choose_level([env_id], level)
         self._reset_seeds()
         self._reset_options()
         observation = self.environment.reset(seed=seeds)

@@ -10,6 +10,7 @@ measures more with the same functions: many sizes, memory, and other suites.
 from __future__ import annotations
 
 import argparse
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -47,13 +48,14 @@ class Stopwatch:
 
     def __init__(self, function: Callable[..., Any], count: Callable[..., int]) -> None:
         self._function, self._count = function, count
-        self.seconds, self.items = 0.0, 0
+        self.seconds, self.items, self._lock = 0.0, 0, threading.Lock()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         begin = time.perf_counter()
         found = self._function(*arguments, **keywords)
-        self.seconds += time.perf_counter() - begin
-        self.items += self._count(*arguments, **keywords)
+        with self._lock:  # several threads may call it
+            self.seconds += time.perf_counter() - begin
+            self.items += self._count(*arguments, **keywords)
         return found
 
 

@@ -51,7 +51,8 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
 
     Returns:
       The exit status: 0; 1 if a check of `doctor` failed; 2 after an error, with one
-      line on stderr; 130 after an interrupt, 143 after SIGTERM.
+      line on stderr; 130 after an interrupt, 141 if the reader of the output has gone, 143 after
+      SIGTERM.
     """
     arguments = argparse.Namespace()
     try:

@@ -128,12 +128,17 @@ class Core:
         Returns:
           Whether they reached a limit, also if they failed.
         """
-        steps = self.steps[ids] = self.steps[ids] + 1
+        self.steps[ids] += 1
+        at_limit = self.at_limit(ids, step_limit, time_limit)
+        self.ended[ids] = at_limit | self.task.seen.failed[ids]
+        return at_limit
+
+    def at_limit(self, ids: Any, step_limit: int | None, time_limit: float) -> Any:
+        """Returns whether some simulations are at a limit; arguments are those of `count`."""
         # NumPy's False: an operation of a NumPy bool with Python's takes half a microsecond.
-        at_limit = np.False_ if step_limit is None else steps >= step_limit
+        at_limit = np.False_ if step_limit is None else self.steps[ids] >= step_limit
         if time_limit < math.inf:
             at_limit = at_limit | (self.world.time[ids] >= time_limit - TIME_ERROR)
-        self.ended[ids] = at_limit | self.task.seen.failed[ids]
         return at_limit
 
     def read(self, ids: list[int]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dm_control import composer
 from dm_control.composer import observation as composer_observation
 from dm_env import specs
 
-from trl_suite.environments import arguments
+from trl_suite.environments import arguments, hooks
 from trl_suite.environments.core import Core
 from trl_suite.rendering import contexts
 from trl_suite.tasks.task import Task
@@ -21,8 +21,6 @@ from trl_suite.util.options import checked
 HIGHLIGHT = (0.0, 0.5, 0.3)  # colour of a character with a reward of 1, as in dm_control.suite
 CAUSES = ('fell', 'stuck', 'diverged')  # entries of `info` that tell how a task failed
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
-_SUBSTEP_HOOKS = ('before_substep', 'after_substep')
-_NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
 
 
 contexts.install()  # pictures of `physics.render`, too, may come from any thread
@@ -31,9 +29,11 @@ contexts.install()  # pictures of `physics.render`, too, may come from any threa
 class Environment(composer.Environment):
     """`composer.Environment` with all substeps of a step in one call.
 
-    Differences from composer: substeps run in C (`before_substep` and `after_substep` hooks are
-    rejected), observation blocks bypass the observation updater, divergence ends the episode
-    instead of raising an exception, and the full state can be saved and restored.
+    Differences from composer: substeps run in C, and the model is compiled once (hooks of substeps,
+    and `initialize_episode_mjcf`, are refused; so is a task that overrides `get_reward` and the like),
+    observation blocks bypass the observation updater, for which a control step is one update (delays of
+    users' observables count these), divergence ends the episode instead of raising an exception, and
+    the full state can be saved and restored.
 
     As usual in dm_env, `TimeStep.discount` of the last step is 0 if the task failed and 1 if the
     step or time limit ended the episode.
@@ -46,7 +46,6 @@ class Environment(composer.Environment):
       action_map: the map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`).
       step_limit: steps after which an episode is truncated, or None: control steps of 1/30 s, in
         planning environments footsteps, in gaits cycles.
-      at_limit: whether the last step reached the step or time limit, also if it failed.
     """
 
     _task: Task
@@ -67,14 +66,14 @@ class Environment(composer.Environment):
           task: a task that no other environment uses.
           step_limit: steps after which an episode is truncated.
           time_limit: simulated time in s after which an episode is truncated.
-          random: seed; drawn from the operating system if None.
+          random: seed, or a random state; a seed from the operating system if None.
           flat_observation: return all blocks as one vector, under the key 'observations'.
           visualize_reward: whether images show the reward, as in `dm_control.suite`: moving bodies
             turn green as it rises to 1.
 
         Raises:
           ValueError: a limit that is not positive, an invalid seed, a `flat_observation` or
-            `visualize_reward` that is no bool, or substep hooks.
+            `visualize_reward` that is no bool, or hooks that would not be called.
           TypeError: a seed that is not an integer.
         """
         self.step_limit, time_limit = arguments.limits(step_limit, time_limit)
@@ -83,7 +82,9 @@ class Environment(composer.Environment):
         checked('flat_observation', flat_observation, bool)
         checked('visualize_reward', visualize_reward, bool)
         self._flat_observation = flat_observation
-        self.at_limit = False
+        if random is None:
+            random = int(np.random.SeedSequence().generate_state(1)[0])
+        hooks.check(task)
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
@@ -101,28 +102,16 @@ class Environment(composer.Environment):
         if arguments.is_integer(random):
             self.core.seeds[0] = random
         self.blocks, self.action_map = dict(task.blocks), task.action_map
-        # Whether there are hooks to call before or after a step. Checking them takes time.
-        self._hooked = any(self._entity_hooks(name) for name in ('before_step', 'after_step'))
-        for name in _SUBSTEP_HOOKS:
-            overridden = getattr(type(task), name) is not getattr(composer.Task, name)
-            if overridden or self._entity_hooks(name):
-                raise ValueError(f'the task or an entity in it has a {name} hook: {_NO_SUBSTEPS}')
-
-    def _entity_hooks(self, name: str) -> list[Callable[..., None]]:
-        """Returns the hooks of a name that entities override.
-
-        dm_control compares bytecode, which differs from what it expects with `python -OO`.
-        """
-        empty = getattr(composer.Entity, name)
-        hooks = getattr(self._hooks, f'_{name}').entity_hooks
-        return [hook for hook in hooks if getattr(hook, '__func__', hook) is not empty]
+        # Whether there are hooks to call; checking them takes time.
+        called = hooks.called(task)
+        self._hooked = 'before_step' in called or 'after_step' in called
+        self._begun_by_hooks = 'initialize_episode' in called
 
     def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
         self.core.usable()
-        if hook_name in _SUBSTEP_HOOKS:
-            raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
+        hooks.check_extra(hook_name)
         super().add_extra_hook(hook_name, hook_callable)
-        self._hooked = True
+        self._hooked = self._begun_by_hooks = True
 
     def _make_observation_updater(self) -> composer_observation.Updater:
         # Of a user's own observables; with one substep, it counts a control step as a single update.
@@ -145,10 +134,11 @@ class Environment(composer.Environment):
             if level is not None:
                 core.task.choose_level([0], level)
             core.ended[0] = True  # until the reset has succeeded
-            self.at_limit = False
             self._show_reward(0.0)
             # Composer's hooks: that of the task, `Task.initialize_episode`, and those of entities.
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+            if self._begun_by_hooks:  # which may have changed the state of the physics
+                core.world.forward(core.world.all_ids)
             core.restart(0)
             if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
@@ -158,16 +148,16 @@ class Environment(composer.Environment):
         """Takes one action; begins a new episode instead if the last time step ended one.
 
         Args:
-          action: clipped to [-1, 1], shape of `action_spec()`.
+          action: clipped to [-1, 1], shape of `action_spec()`; ignored if an episode begins.
 
         Raises:
           ValueError: an action of the wrong shape, or with NaN or infinity.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
         with self.core as core:
-            action, task, physics = self.action_map.checked(action), core.task, self._physics_proxy
             if core.ended[0]:
                 return self.reset()
+            action, task, physics = self.action_map.checked(action), core.task, self._physics_proxy
             if self._has_own_observables:
                 self._observation_updater.prepare_for_next_control_step()
             if self._hooked:  # by way of `Task.before_step` and `after_step`: the same as `advance`
@@ -176,7 +166,7 @@ class Environment(composer.Environment):
                 self._hooks.after_step(physics, self._random_state)
             else:
                 task.advance(action[None], core.world.all_ids)
-            self.at_limit = bool(core.count(0, self.step_limit, self._time_limit))
+            core.count(0, self.step_limit, self._time_limit)
             if self._has_own_observables:
                 self._observation_updater.update()
             reward, failed = float(task.seen.reward[0]), bool(task.seen.failed[0])
@@ -208,6 +198,11 @@ class Environment(composer.Environment):
           RuntimeError: after `close`.
         """
         return self.core.usable().task
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether the last step reached the step or time limit, also if it failed."""
+        return bool(self.core.usable().at_limit(0, self.step_limit, self._time_limit))
 
     @property
     def level(self) -> int | None:
@@ -245,10 +240,9 @@ class Environment(composer.Environment):
         if not self._flat_observation:
             found = {name: row[part] for name, part in self.blocks.items()}
         if self._has_own_observables:
-            own = self._observation_updater.get_observation()
-            found |= {name: np.asarray(value, float) for name, value in own.items()}
+            found |= self._observation_updater.get_observation()
         if self._flat_observation:
-            parts = [row, *(value.ravel() for value in found.values())]
+            parts = [row, *(np.ravel(value) for value in found.values())]
             return {FLAT_OBSERVATION_KEY: np.concatenate(parts)}
         return found
 
@@ -256,10 +250,13 @@ class Environment(composer.Environment):
         return self.task.action_spec(self._physics_proxy)
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        return {
-            name: specs.Array(value.shape, value.dtype, name)
+        found = {
+            name: specs.Array(np.shape(value), np.result_type(value), name)
             for name, value in self.observation().items()
         }
+        if self._has_own_observables and not self._flat_observation:
+            found |= self._observation_updater.observation_spec()
+        return found
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state: physics, task, terrain and random streams.

@@ -19,7 +19,7 @@ from numpy.typing import DTypeLike
 
 from trl_suite import rendering
 from trl_suite.engine import BatchWorld, light_model
-from trl_suite.environments import arguments, states
+from trl_suite.environments import arguments, hooks, states
 from trl_suite.environments.arguments import Ids
 from trl_suite.environments.core import Core
 from trl_suite.environments.environment import Environment
@@ -72,7 +72,8 @@ class VectorEnvironment:
       at_limit: whether the last step reached the step or time limit, also if it failed, (n,) bool.
       blocks: slice of each observation block in the flat vector.
       action_map: the map from actions to physical units.
-      control_timestep: duration of a step, s.
+      control_timestep: duration of a step, s; of gaits and footsteps nominal, as it varies
+        (`task.steps_vary`).
     """
 
     def __init__(
@@ -124,6 +125,18 @@ class VectorEnvironment:
             options.pop('step_limit', step_limit), options.pop('time_limit', math.inf)
         )
         task = build_task(self.spec, options)
+        hooks.check(task)
+        if names := hooks.called(task):
+            raise ValueError(
+                f'the task or an entity in it has a hook {names[0]}, which only a single Environment calls'
+            )
+        for entity in task.root_entity.iter_entities():
+            for name, each in entity.observables.as_dict().items():
+                if each.enabled:
+                    raise ValueError(
+                        f"observable {name!r} is an entity's, which only a single Environment has; expected "
+                        "the option 'observations'"
+                    )
         model = light_model(task.root_entity.mjcf_model)
         task.attach(BatchWorld(model, self.num_envs, int(num_threads), task.fields))
         streams = [np.random.RandomState(0)] * self.num_envs
@@ -298,6 +311,9 @@ class VectorEnvironment:
           RuntimeError: only some simulations are restored before the first reset.
         """
         self.core.set_state(state, env_ids)
+        ids = arguments.given_ids(env_ids, self.num_envs)
+        self.at_limit = self.at_limit.copy()
+        self.at_limit[ids] = self.core.at_limit(ids, self.step_limit, self.time_limit)
 
     def copy_from(
         self, other: VectorEnvironment, other_ids: Sequence[int], env_ids: Sequence[int]

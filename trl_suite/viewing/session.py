@@ -88,6 +88,7 @@ class Session:
         """Starts an episode; with a seed, the counts and the plots start again, too."""
         if seed is not None:
             self.environment.random_state.seed(seed)
+            self.environment.core.seeds[0] = seed
             self.episode = 0
             self.history.clear()
             self._clock = 0.0
