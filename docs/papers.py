@@ -42,7 +42,9 @@ GAITS = (
     'Hopper2D_Terrain_Mixed', 'Biped2D_Terrain_Mixed', 'Dog2D_Terrain_Stairs_Rugged',
 )  # fmt: skip
 CONDITIONS = (
-    'straight', 'general', 'bumps of 6 cm', 'belts of 0.6 m/s', 'pushes of 150 N', 'pushes of 250 N',
+    'straight', 'straight, 0.3 m', 'straight, 0.7 m', 'general', 'made from the root',
+    'made from the root, on the spot', 'made from the root, turning about', 'bumps of 6 cm',
+    'belts of 0.6 m/s', 'pushes of 150 N', 'pushes of 250 N',
 )  # fmt: skip
 
 # DeepLoco (2017), supplement, table 3: normalised reward of a planner with the controller of a style,
@@ -62,8 +64,9 @@ STYLES = {
     'nominal or stand': ('General Stand', {}),
 }  # fmt: skip
 STANDS = (
-    'straight', 'general', 'stops', 'stands', 'stands, pushes of 100 N', 'stands on a ramp of 8 %',
-    'made from the root, on the spot', 'pushes of 150 N',
+    'straight', 'straight, 0.7 m', 'general', 'stops', 'stands', 'stands, pushes of 100 N',
+    'stands on a ramp of 8 %', 'made from the root, on the spot', 'made from the root, turning about',
+    'bumps of 6 cm', 'belts of 0.6 m/s', 'pushes of 150 N',
 )  # fmt: skip
 TASKS = {'soccer': 'Soccer', 'path': 'PathFollowing', 'pillars': 'Forest'}
 
@@ -152,12 +155,17 @@ def footsteps() -> str:
 
 
 def plans() -> str:
-    rows = [
-        (f'`{id}`', *(f'{found[policy]["reward"]:.2f}' for policy in ('scripted', 'reference')),
-         f'{found["reference"]["survived"]:.0%}')
-        for id, found in gallery.record('plans').items() if 'scripted' in found
-    ]  # fmt: skip
-    return table(('planner', 'score, scripted', 'score, trained', 'no fall in 200 s'), rows)
+    rows = []
+    for id, found in gallery.record('plans').items():
+        if 'scripted' in found:
+            react = found.get(f'reference with {controllers("React")}')
+            rows.append((
+                f'`{id}`', *(f'{found[policy]["reward"]:.2f}' for policy in ('scripted', 'reference')),
+                f'{found["reference"]["survived"]:.0%}',
+                *(('–', '–') if react is None else (f'{react["reward"]:.2f}', f'{react["survived"]:.0%}')),
+            ))  # fmt: skip
+    columns = 'score, scripted', 'score, trained', 'no fall', 'score, react', 'no fall, react'
+    return table(('planner', *columns), rows)
 
 
 def foresight() -> str:
@@ -180,11 +188,12 @@ def styles() -> str:
         found = gallery.record('footsteps').get(controllers(part))
         if found is None:
             continue
-        general, pushed = found['general'], found['pushes of 150 N']
+        general, *harder = (found[k] for k in ('general', 'pushes of 150 N', 'bumps of 3 cm'))
         rows.append((
             name, f'{general["hip_above_knee"]:.2f}', pair(general, 'right_knee', 'left_knee'),
             pair(general, 'lean', 'tilt'),
-            f'{general["survived"]:.0%}', f'{general["landing"]:.3f}', f'{pushed["survived"]:.0%}',
+            f'{general["survived"]:.0%}', f'{general["landing"]:.3f}',
+            *(f'{each["survived"]:.0%}' for each in harder),
         ))  # fmt: skip
     columns = (
         'hip above knee, m',
@@ -193,6 +202,7 @@ def styles() -> str:
         'no fall',
         'landing error, m',
         'no fall, 150 N',
+        'no fall, 3 cm bumps',
     )
     return table(('style', *columns), rows)
 

@@ -421,6 +421,24 @@ class GoalTest(parameterized.TestCase):
         expected = before if ahead is None else np.arctan2(way[1], way[0])
         self.assertLess(angle_between(heading(task)[0], expected), 1e-9)
 
+    def test_plans_that_react_head_for_the_goal(self):
+        """From the middle of the places that have moved with the foot."""
+        environment, _ = started(goal=True, start_phase=0.4, plans={'react': 1.0})
+        task = environment.task
+        task.goal[0, :2] += 2.0, 3.0
+        places = task.plan.landing[0, :, :2].copy()
+        for _ in range(3):
+            environment.step(np.zeros(17))
+        self.assertEqual(task.plan.stance[0], LEFT)
+        missed = ankles(environment)[LEFT, :2] - places[0]
+        self.assertGreater(np.hypot(*missed), 0.02)
+        x, y = task.goal[0, :2] - places.mean(0) - missed
+        self.assertLess(angle_between(heading(task)[0], np.arctan2(y, x)), 1e-9)
+        np.testing.assert_allclose(task.plan.landing[0, 0, :2], places[1] + missed, atol=1e-9)
+        ends = task.plan.landing[:, 0], task.plan.landing[:, 1]
+        sizes = length_and_width(*ends, heading(task), LEFT)
+        np.testing.assert_allclose(np.ravel(sizes), [0.5, 0.15], atol=1e-9)
+
 
 class RewardTest(parameterized.TestCase):
     """The reward of the specification."""
@@ -739,6 +757,8 @@ REFUSED = (
     (PLANAR, {'plans': {'width': (0.1, 0.2)}}, "unknown option of plans 'width'"),
     *((GENERAL, {'plans': {name: value}}, message) for name, value, message in (
         ('width', (-0.1, 0.2), 'width is'), ('width', (0.1, np.inf), 'width is'), ('sharp', -0.1, 'sharp is -0.1'),
+        ('stay', (1, 1e30), r'stay is \(1, 1e\+30\); expected .* from 1 to 10000, in footsteps'),
+        ('stay', 2.5, r'stay is \(2.5, 2.5\); expected whole numbers of footsteps, such as \(3, 3\)'),
         ('from_root', np.nan, 'from_root is nan'), ('react', 1.5, 'react is 1.5'), ('turn', -1, 'turn is -1'),
         ('lenght', 0.5, "unknown option of plans 'lenght'; did you mean 'length'"),
     )),

@@ -757,6 +757,12 @@ class OptionTest(FolderTest):
              'the task HierarchicalNavigation has no reference clip'),
             (lambda: started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0'),
              f"did you mean '{hierarchical.CONTROLLER}'"),
+            (lambda: started(PLANE, controller='stand'),
+             "unknown controller 'stand'; known: FILE.npz, PD_Biped3D_LLC_Bumps_Step-v0, .*_Stand_Step-v0, "),
+            *((lambda c=c: started(SOCCER, controller=c),
+               "'PD_Biped3D_LLC_Run_FootStep-v0' has footsteps of 0.3 s; expected 0.5 s, as .*_Soccer-v0 has them: "
+               f'{hierarchical.CONTROLLER}, ')
+              for c in ('PD_Biped3D_LLC_Run_FootStep-v0', [hierarchical.CONTROLLER, 'deeploco/llc_run_footstep'])),
             (lambda: started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0'),
              "policy of 'FSM_Goat2D.*' observes .*plan 13"),
             (lambda: started(PLANE, controller=without_plan),

@@ -89,7 +89,7 @@ class DeterminismTest(parameterized.TestCase):
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 STEP2D, STEP3D = 'PD_Biped2D_LLC_Flat_Step-v0', 'PD_Biped3D_LLC_{}_Step-v0'
-GENERAL, TRAIL = STEP3D.format('General'), STEP3D.format('Trail')
+GENERAL, TRAIL, STAND = (STEP3D.format(name) for name in ('General', 'Trail', 'Stand'))
 IMITATE, HILLS = 'PD_Biped3D_Imitate{}-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0'
 FOREST, MOVERS, SOCCER = (
     f'PD_Biped3D_HLC_{name}-v0' for name in ('Forest', 'DynamicsObstacles', 'Soccer')
@@ -122,7 +122,8 @@ VARIANTS = (
     (IMITATE.format('-Hills'), {'terrain_observation': 'height'}), (IMITATE.format('-Track'), {}),
     (IMITATE.format('-Steps'), {'mirrored': True, 'terrain_observation': 'height'}),
     (IMITATE.format(''), {'action_offset': 'original'}),
-    (SOCCER, {'interface': 'frame'}),
+    (STAND, {'plans': {'stop': 0.5, 'stay': 3}}),
+    (SOCCER, {'interface': 'frame'}), (SOCCER, {'controller': [GENERAL, STAND]}),
     (MOVERS, {'interface': 'frame', 'terrain_observation': ('height', 'velocity')}),
     *((id_, {'face_length': 0.1}) for id_ in (GAPS, 'FSM_Goat2D_Terrain_Variable_Steps-v0')),
     (DOG, {'levels': (0, 1000)}), (GAITS[0], {'levels': (0, 1000)}),

@@ -9,7 +9,9 @@ episodes that last to the end, the mean reward per step (0 after a fall), the di
 to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
 heading error at landing; and of the posture, the least height of the hip above the knee and the largest
 flexion of the knee in a swing, of both legs and of each, and the lean of the trunk, forwards and to the
-right (means). Those of reference policies are written to trained/footsteps.json.
+right (means). Of walkers that are to stand throughout, the drift is printed, too: how far the root moves
+from the first landing beside the stance foot to the end (mean over the episodes that last to the end). Results
+of reference policies are written to trained/footsteps.json.
 """
 
 from __future__ import annotations
@@ -24,13 +26,17 @@ import runs
 from trl_suite import policies, suite
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.cli.arguments import positive
+from trl_suite.registry import catalogue
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.common.footstep_plan import LEFT, RIGHT
+from trl_suite.util import errors
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped3D_LLC_General_Step-v0'
 SECONDS = 20.0  # of an episode
+LEAST_SECONDS = 3.0  # six footsteps
 STEADY = {'turn': 0.0, 'sharp': 0.0}
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'sharp': 0.0}
 STAY = {'stop': 1.0}
@@ -110,47 +116,55 @@ def postures(task: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def run(
     spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
 ) -> dict[str, Any]:
-    """Runs one episode in every simulation; returns survival, reward, errors and posture."""
+    """Runs one episode in every simulation; returns survival, reward, errors, posture and drift."""
     steps = round(seconds / CONTROL_TIMESTEP)
     environments = VectorEnvironment(
         spec, episodes, 0, seed, autoreset='disabled', step_limit=steps, task_kwargs=options
     )
     policy.check(environments)
     observation = environments.reset()
-    runs, reward = np.ones(episodes, bool), 0.0
+    going, reward = np.ones(episodes, bool), 0.0
+    root = environments.task.body.measurement.root
+    landings, stood = np.zeros(episodes, int), np.zeros((episodes, 2))
     full, distance = np.zeros(episodes, bool), np.zeros(episodes)
     landing, heading, lean = [], [], []
     swings, swing = [], np.tile([[np.inf], [0.0]], episodes)  # extremes of the present step
-    while runs.any():
+    while going.any():
         side = 1 - environments.task.plan.stance
-        step = environments.step(policy(observation), runs)
-        reward += float(step.reward[runs].sum())
-        landed = step.info['landed'] & runs
+        step = environments.step(policy(observation), going)
+        reward += float(step.reward[going].sum())
+        landed = step.info['landed'] & going
+        landings += landed
+        beside = landed & (landings == 2)  # the first place was planned before the stop
+        stood[beside] = root[beside, :2]
         heights, flexion, leans = postures(environments.task)
         rows = np.arange(episodes)
         swing[0] = np.minimum(swing[0], heights[rows, side])
         swing[1] = np.maximum(swing[1], flexion[rows, side])
         swings.append(np.append(swing, side[None], axis=0)[:, landed])
-        lean.append(leans[runs])
+        lean.append(leans[going])
         swing[:, step.info['landed']] = [[np.inf], [0.0]]
         landing.append(step.info['landing_error'][landed])
         heading.append(step.info['heading_error'][landed])
         ended = step.terminated | step.truncated
-        distance[ended & runs] = step.info['distance'][ended & runs]
-        full[ended & runs] = step.truncated[ended & runs]
-        runs &= ~ended
+        distance[ended & going] = step.info['distance'][ended & going]
+        full[ended & going] = step.truncated[ended & going]
+        going &= ~ended
         observation = step.observation
+    stands = environments.task.plans.stop == 1 and full.any()
+    drift = np.linalg.norm(root[:, :2] - stood, axis=1)[full]
     environments.close()
-    errors, turns = np.concatenate(landing), np.concatenate(heading)
+    misses, turns = np.concatenate(landing), np.concatenate(heading)
     least, most, leg = np.concatenate(swings, axis=1)
     forwards, to_the_right = np.concatenate(lean).mean(0).tolist()
     return {
         'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
-        'normalized_return': reward / (steps * episodes), 'landing': float(errors.mean()),
-        'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
+        'normalized_return': reward / (steps * episodes), 'landing': float(misses.mean()),
+        'landing_90': float(np.quantile(misses, 0.9)), 'heading': float(turns.mean()),
         'distance': float(distance.mean()), 'hip_above_knee': float(least.mean()),
         'knee': float(most.mean()), 'right_knee': float(most[leg == RIGHT].mean()),
         'left_knee': float(most[leg == LEFT].mean()), 'lean': forwards, 'tilt': to_the_right,
+        **({'drift': float(drift.mean())} if stands else {}),
     }  # fmt: skip
 
 
@@ -166,7 +180,10 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=SECONDS)
     arguments = parser.parse_args()
+    checked('--seconds', arguments.seconds, float, 's', at_least=LEAST_SECONDS)
     id_ = suite.find(arguments.id).id
+    known = [spec.id for spec in catalogue.SPECS if spec.task_type == 'spatial_footsteps']
+    errors.check_known('environment with footsteps in 3D', known, id_)
     if arguments.policy and arguments.variant:
         parser.error('give either a file or --variant, not both')
     policy = (
@@ -182,7 +199,8 @@ def main() -> None:
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
             f'heading {result["heading"]:.3f} rad  hip above knee {result["hip_above_knee"]:.2f} m  '
             f'knee {result["right_knee"]:.2f} and {result["left_knee"]:.2f}, '
-            f'lean {result["lean"]:.2f} and {result["tilt"]:.2f} rad',
+            f'lean {result["lean"]:.2f} and {result["tilt"]:.2f} rad'
+            + (f'  drift {result["drift"]:.2f} m' if 'drift' in result else ''),
             flush=True,
         )
         if not arguments.policy and not arguments.variant:

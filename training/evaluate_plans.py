@@ -25,7 +25,7 @@ import numpy as np
 import runs
 from expert import expert, joint_expert
 
-from trl_suite import policies
+from trl_suite import policies, suite
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.cli.arguments import positive
 from trl_suite.registry import catalogue
@@ -71,28 +71,28 @@ def run(
     def places() -> np.ndarray:
         return task.world.xpos[:, root, :2].copy()
 
-    runs, fell = np.ones(episodes, bool), np.zeros(episodes, bool)
+    going, fell = np.ones(episodes, bool), np.zeros(episodes, bool)
     reward, seconds, towards, path, goals, arrived = np.zeros((6, episodes))
     before = places()
     begin = along_trails(environments, before)
     trail = np.zeros(episodes)
-    while runs.any():
-        step = environments.step(policy(observation), runs)
+    while going.any():
+        step = environments.step(policy(observation), going)
         info, after = step.info, places()
-        reward += step.reward * runs
+        reward += step.reward * going
         duration = info.get('duration', duration)
-        seconds += duration * runs
-        towards += info['speed'] * duration * runs
-        path += np.linalg.norm(after - before, axis=1) * runs
-        arrived += info.get('at_goal', np.zeros(episodes)) * duration * runs
+        seconds += duration * going
+        towards += info['speed'] * duration * going
+        path += np.linalg.norm(after - before, axis=1) * going
+        arrived += info.get('at_goal', np.zeros(episodes)) * duration * going
         if 'at_goal' not in info:
-            goals[runs] = info['goals_reached'][runs]
+            goals[going] = info['goals_reached'][going]
         ended = step.terminated | step.truncated
-        if (ended & runs).any():
+        if (ended & going).any():
             last = along_trails(environments, after) - begin
-            trail[ended & runs] = last[ended & runs]
-        fell |= step.terminated & runs
-        runs &= ~ended
+            trail[ended & going] = last[ended & going]
+        fell |= step.terminated & going
+        going &= ~ended
         observation, before = step.observation, after
     environments.close()
     return {
@@ -129,17 +129,22 @@ def main() -> None:
     parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
     parser.add_argument('--episodes', type=positive, default=EPISODES)
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--controller', help='footstep controller, instead of the default')
+    parser.add_argument('--controller', help='id of another footstep controller')
     arguments = parser.parse_args()
-    ids = [
-        spec.id
-        for spec in catalogue.SPECS
-        if spec.tags.intersection(TAGS) and fnmatch.fnmatchcase(spec.id, arguments.pattern)
-    ]
+    options, under = {}, ''
+    specs = [spec for spec in catalogue.SPECS if spec.tags.intersection(TAGS)]
+    if arguments.controller is not None:
+        controller = suite.find(arguments.controller)
+        options, under = {'controller': controller.id}, f' with {controller.id}'
+        specs = [
+            spec
+            for spec in specs
+            if 'hierarchical' in spec.tags and spec.character == controller.character
+        ]
+    known = [spec.id for spec in specs]
+    ids = [id_ for id_ in known if fnmatch.fnmatchcase(id_, arguments.pattern)]
     if not ids:
-        raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
-    options = {} if arguments.controller is None else {'controller': arguments.controller}
-    under = '' if arguments.controller is None else f' with {arguments.controller}'
+        raise ValueError(errors.unknown(f'environment{under}', arguments.pattern, known))
     for id_ in ids:
         for name in arguments.policies:
             make = maker(id_, name)

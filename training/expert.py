@@ -28,6 +28,7 @@ from trl_suite.tasks.navigation.hierarchical import (
     plan_action_map,
 )
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
+from trl_suite.tasks.rewards import wrapped
 from trl_suite.vector import VectorEnvironment
 
 REACH = 5.0  # m; half the map's side
@@ -49,10 +50,7 @@ BEYOND = 1.5  # assumed cost per m outside the map
 
 Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Returns angles in rad wrapped to [-pi, pi]."""
-    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
+wrap = wrapped.function  # compiled, it takes no arrays
 
 
 class Map:

@@ -6,8 +6,9 @@
 
 It starts from the shipped planner, by PPO; an interrupted run continues from its checkpoint in --output. With
 several controllers the planner selects one in every step, or with --each it is trained with all of them side
-by side, each in as many simulations. The results of `evaluate_plans.py` with this planner are printed, and with
---enter written to trained/plans.json, for the report.
+by side, each in as many simulations. Of the evaluations during training, with the first controller only, the best
+planner is kept. The results of `evaluate_plans.py` with it are printed, and with --enter written to
+trained/plans.json with the training, for the report.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ def main() -> None:
     parser.add_argument('--enter', action='store_true', help='write results to trained/plans.json')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     arguments = parser.parse_args()
+    if arguments.each and len(arguments.controllers) < 2:
+        raise ValueError('--each has one controller; expected at least two, or no --each')
     id_, ids = suite.find(arguments.id).id, [suite.find(each).id for each in arguments.controllers]
     parts: list[Any] = ids if arguments.each or len(ids) == 1 else [ids]
     how = 'one planner, ' * arguments.each + 'fine-tuned with '
@@ -67,6 +70,7 @@ def main() -> None:
     folder = arguments.output / f'{id_}_with_{names}' / f'seed_{arguments.seed}'
     ppo.train(id_, arguments.seed, fine_tuned(id_, arguments.samples, *parts), folder, 1)
     policy = policies.load(folder / 'policy.npz')
+    training = {'controllers': ids, 'samples': arguments.samples, 'seed': arguments.seed}
     for controller in parts:
         result = evaluate_plans.run(
             id_, lambda environments: policy, arguments.episodes, 0, controller=controller
@@ -74,7 +78,7 @@ def main() -> None:
         under = how + (controller if isinstance(controller, str) else ', '.join(controller))
         print(under, {name: round(value, 3) for name, value in result.items()}, flush=True)
         if arguments.enter:
-            runs.add('plans.json', id_, under, result)
+            runs.add('plans.json', id_, under, {**result, 'training': training})
 
 
 if __name__ == '__main__':

@@ -31,7 +31,8 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest
 from programs import output
 
-from trl_suite import benchmark, characters, evaluation, policies
+from trl_suite import benchmark, characters, evaluation, policies, suite
+from trl_suite.motion import quaternion
 from trl_suite.registry import catalogue
 from trl_suite.runs import Course
 from trl_suite.util import files
@@ -435,15 +436,19 @@ class GeneralistTest(FolderTest):
 
 
 class FootstepsTest(parameterized.TestCase):
-    """The shipped footstep controller."""
+    """The shipped footstep controllers."""
+
+    def tracked(self, name, condition, episodes, seconds):
+        """The results of one of them."""
+        id_ = f'PD_Biped3D_LLC_{name}_Step-v0'
+        row, options = evaluate_footsteps.under(id_, condition)
+        return evaluate_footsteps.run(row, policies.reference(id_), episodes, 1, seconds, **options)
 
     @parameterized.parameters(
         ('straight, 0.3 m', 0.05), ('straight, 0.7 m', 0.06), ('general', 0.08)
     )
     def test_it_lands_on_its_plan(self, condition, error):
-        id_ = evaluate_footsteps.ID
-        row, options = evaluate_footsteps.under(id_, condition)
-        found = evaluate_footsteps.run(row, policies.reference(id_), 6, 1, 5.0, **options)
+        found = self.tracked('General', condition, 6, 5.0)
         self.assertEqual(found['survived'], 1.0)
         self.assertLess(found['landing'], error)
 
@@ -459,12 +464,59 @@ class FootstepsTest(parameterized.TestCase):
         self.assertContainsSubset(plans.items(), options['plans'].items())
 
     def test_strong_pushes_are_survived_with_plans_that_react(self):
-        survived = []
-        for id_ in (evaluate_footsteps.ID, 'PD_Biped3D_LLC_React_Step-v0'):
-            row, options = evaluate_footsteps.under(id_, 'pushes of 250 N')
-            found = evaluate_footsteps.run(row, policies.reference(id_), 16, 1, 10.0, **options)
-            survived.append(found['survived'])
+        survived = [
+            self.tracked(name, 'pushes of 250 N', 16, 10.0)['survived']
+            for name in ('General', 'React')
+        ]
         self.assertGreater(survived[1], survived[0] + 0.3)
+
+    @parameterized.parameters(
+        ('General', {'hip_above_knee': (0.34, 0.39), 'lean': (-0.1, 0.1), 'tilt': (-0.05, 0.05)}),
+        ('HighKnees', {'hip_above_knee': (0.2, 0.32)}),
+        ('StraightLegs', {'right_knee': (0.3, 0.7), 'left_knee': (0.3, 0.7)}),
+        ('OneStraightLeg', {'right_knee': (0.9, 1.3), 'left_knee': (0.3, 0.7)}),
+        ('ForwardLean', {'lean': (0.4, 0.6)}), ('SidewaysLean', {'tilt': (0.25, 0.45)}),
+        ('InPlace', {'distance': (0.0, 1.0)}),
+    )  # fmt: skip
+    def test_it_has_its_style(self, name, limits):
+        found = self.tracked(name, 'general', 4, 4.0)
+        self.assertEqual(found['survived'], 1.0)
+        for key, (low, high) in limits.items():
+            self.assertBetween(found[key], low, high, key)
+        self.assertNotIn('drift', found)
+
+    def test_it_stands(self):
+        drifts = [self.tracked(name, 'stands', 4, 8.0)['drift'] for name in ('Stand', 'General')]
+        self.assertLess(drifts[0], 0.5 * drifts[1])
+
+    @parameterized.parameters(((0, 0.3, 0), (0.3, 0)), ((0.4, 0, 0), (0, 0.4)))
+    def test_postures(self, turn, lean):
+        """Of a walker that heads elsewhere, with a raised right thigh, bent knees and a turned trunk."""
+        environment = suite.make(evaluate_footsteps.ID, {'random': 0})
+        environment.reset()
+        task, joints = environment.task, environment.physics.named.data.qpos
+        environment.physics.data.qpos[task.body.pose_qpos[3:7]] = quaternion.about_z(1.0)
+        for name, value in (
+            ('torso', quaternion.from_vector(np.array(turn, float))),
+            ('right_hip', quaternion.from_vector(np.array([0, -0.5, 0]))),
+            ('left_hip', (1, 0, 0, 0)), ('right_knee', -0.6), ('left_knee', -0.9),
+        ):  # fmt: skip
+            joints[f'biped3d_mocap/{name}'] = value
+        environment.physics.forward()
+        task.observe()
+        heights, flexion, leans = evaluate_footsteps.postures(task)
+        thigh = 0.4215  # m
+        np.testing.assert_allclose(heights, [[thigh * np.cos(0.5), thigh]], atol=1e-9)
+        np.testing.assert_allclose(flexion, [[0.6, 0.9]], atol=1e-9)
+        np.testing.assert_allclose(leans, [lean], atol=1e-9)
+
+    @parameterized.parameters(
+        (['--seconds', '0.03'], '--seconds is 0.03; expected a number at least 3'),
+        (['--id', 'PD_Biped2D_LLC_Flat_Step-v0'], "unknown environment with footsteps in 3D 'PD_Biped2D.*mean"),
+    )  # fmt: skip
+    def test_refused(self, arguments, message):
+        with self.assertRaisesRegex(ValueError, message):
+            output(evaluate_footsteps.main, *arguments)
 
 
 class PlanEvaluationTest(FolderTest):
@@ -484,6 +536,25 @@ class PlanEvaluationTest(FolderTest):
                 runs.read('plans.json'), {id_: {'of another process': result, 'scripted': result}}
             )
 
+    def test_a_controller_is_entered_by_its_id_where_it_fits(self):
+        given, asked = ('--policies', 'scripted', '--controller', 'deeploco/llc_run_footstep'), []
+
+        def run(*arguments, controller):
+            asked.append(controller)
+            return {}
+
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(evaluate_plans, 'run', run),
+        ):
+            output(evaluate_plans.main, *given)
+            with self.assertRaisesRegex(ValueError, 'unknown environment with .*mean.*_Run-v0'):
+                output(evaluate_plans.main, 'PD_Biped3D_HLC_PathFollowing-v0', *given)
+            [controller], [(id_, found)] = asked, runs.read('plans.json').items()
+        self.assertEqual(id_, 'PD_Biped3D_HLC_PathFollowing_Run-v0')
+        self.assertEqual(controller, 'PD_Biped3D_LLC_Run_FootStep-v0')
+        self.assertEqual(found, {f'scripted with {controller}': {}})
+
 
 class PlannerTransferTest(absltest.TestCase):
     def test_starts_from_the_shipped_planner_with_the_controller(self):
@@ -496,6 +567,11 @@ class PlannerTransferTest(absltest.TestCase):
         actions = np.clip(trainer.unmirrored(trainer.means(seen), left), -1, 1)
         expected = policies.reference(id_)(trainer.observation)
         np.testing.assert_allclose(actions, expected, atol=2e-3)  # the scales are rounded
+
+    def test_one_planner_needs_several_controllers(self):
+        given = ('PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_Stand_Step-v0', '--each')
+        with self.assertRaisesRegex(ValueError, '--each has one controller; expected at least two'):
+            output(transfer_planners.main, *given)
 
 
 class PageTest(FolderTest):

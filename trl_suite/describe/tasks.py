@@ -173,7 +173,7 @@ def _plans(task: Any) -> list[str]:
         low, high = plans.stay
         lines.append(
             f'at a landing, the walker is to stop with probability {plans.stop:g}, and to stay for {low:g} to '
-            f'{high:g} steps'
+            f'{high:g} footsteps'
         )
     if plans.react:
         lines.append(f'at a landing, the plan moves by {plans.react:g} of the landing error')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ from trl_suite import characters, motion, policies
 from trl_suite import terrain as terrains
 from trl_suite.actuation import Actuators, realism
 from trl_suite.arenas import PlanarArena, SpatialArena, scene
-from trl_suite.registry.catalogue import ALIASES, BY_ID, find
+from trl_suite.registry.catalogue import ALIASES, BY_ID, SPECS, find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks import variation
 from trl_suite.tasks.task import Task
@@ -92,7 +93,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     else:
         for each in dataclasses.fields(config_type):
             if each.metadata['policy']:
-                given[each.name] = _policy(each.name, given.get(each.name, each.default))
+                given[each.name] = _policy(each.name, given.get(each.name, each.default), spec)
         config = config_type.parse(spec.id, given, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
@@ -116,15 +117,32 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     return task
 
 
-def _policy(name: str, source: Any) -> Any:
-    """Returns the policy shipped for an id or alias, or a list of them; other sources are unchanged."""
+def _policy(name: str, source: Any, spec: EnvSpec) -> Any:
+    """Returns the policy shipped for an id or alias, or a list of them; other sources are unchanged.
+
+    Raises:
+      ValueError: an unknown id, or a footstep controller whose footsteps last longer or shorter than those
+        of the environment; the message has the controllers that fit.
+    """
     if isinstance(source, (list, tuple)):
-        return [_policy(name, each) for each in source]
+        return [_policy(name, each, spec) for each in source]
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
+    clip = spec.part('clip')
+    fitting = [each.id for each in SPECS if 'controller' in each.tags and each.clip == clip]
     if source not in BY_ID and source not in ALIASES:
-        raise ValueError(errors.unknown(name, source, (*policies.available(), 'FILE.npz')))
-    return policies.reference(find(source).id)
+        known = fitting or policies.available()
+        raise ValueError(errors.unknown(name, source, (*known, 'FILE.npz')))
+    own, type_ = find(source), task_type(spec)
+    tracks = type_ is not None and type_.motion is motion.FootstepLibrary
+    if tracks and 'controller' in own.tags and own.clip != clip:
+        theirs, ours = (_motion(each, motion.FootstepLibrary).duration for each in (own, spec))
+        if not math.isclose(theirs, ours):
+            raise ValueError(
+                f'{name} {own.id!r} has footsteps of {theirs:g} s; expected {ours:g} s, as {spec.id} has them: '
+                f'{", ".join([*fitting, "FILE.npz"])}'
+            )
+    return policies.reference(own.id)
 
 
 def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators, config: Any) -> Parts:

@@ -133,7 +133,7 @@ _STYLES = (
         plans={'length': (0.0, 0.1), 'turn': 0.2, 'change': 1.0},
     ),
     _styled(
-        'Stand', 'stand', 'and stands still where it is to stay', plans={'stop': 0.1},
+        'Stand', 'stand', 'with stops', plans={'stop': 0.1},
         origin='addition', differences=(),
     ),
 )  # fmt: skip

@@ -24,6 +24,7 @@ ROOT_TURN_LIMIT = 1.2  # rad; largest turn of a plan relative to the root
 NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading
 GOAL_REACHED = 1.0  # m; a nearer goal is redrawn
 FAR = 10.0  # m; largest length and width of a step
+LONGEST_STAY = 10_000  # footsteps
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,23 +81,32 @@ class Plans(Config):
     stop: float = option(
         0.0,
         'probability that the walker is to stop at a landing: the swing foot lands beside the stance foot, '
-        'and both stay; stands with a style that has them',
+        "and both stay; for standing, combine with style='stand'",
         at_least=0,
         at_most=1,
     )
     stay: Range = option(
         Range(4, 40),
-        'number of footsteps of the clock for which it then stays',
-        unit='footsteps',
-        at_least=1,
+        'number of footsteps of the clock for which it then stays, including the one that lands beside the '
+        'stance foot',
+        **within(1, LONGEST_STAY, 'footsteps'),
     )
     react: float = option(
         0.0,
-        'share of the landing error by which a plan moves with the walker at each landing: 0, landing '
-        'places stand still in the world; 1, they are relative to where the foot landed',
+        'share of the landing error by which a plan moves with the walker at each landing, however large the '
+        'error: 0, landing places stand still in the world; 1, they are relative to where the foot landed',
         at_least=0,
         at_most=1,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(limit % 1 for limit in self.stay):
+            low, high = self.stay
+            raise ValueError(
+                f'stay is ({low:g}, {high:g}); expected whole numbers of footsteps, such as '
+                f'({math.ceil(low)}, {math.ceil(high)})'
+            )
 
 
 class PlanTask(TrackingTask):

@@ -48,7 +48,7 @@ class FootstepState(NamedTuple):
       shift: position of the origin of its track, (n, 2) m.
       goal: position of the goal, (n, 3) m.
       excused: control step of an episode until which landing errors do not count.
-      staying: number of further steps for which the walker is to stay where it is.
+      staying: number of further footsteps for which the walker is to stay where it is.
       missed: whether the landing error was too large in the last step.
     """
 

@@ -69,8 +69,8 @@ class HierarchicalConfig(GroundConfig):
         CONTROLLER,
         (
             'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
-            'of its file, or a function; or a list of them, of which every action selects one; it does not act '
-            "with the interface 'frame'"
+            'of its file, or a function; or a list of them, of which every action selects one, of equal numbers '
+            "the first; it does not act with the interface 'frame'"
         ),
         policy=True,
     )
@@ -122,7 +122,7 @@ class HierarchicalNavigation(GoalTask):
     episode may be shorter. A plan has the landing place of the swing foot, the next landing place
     of the stance foot, and a heading, relative to position and heading of the root at the beginning
     of the step. With several footstep controllers, an action also has a number for each; the largest
-    selects the controller of the step.
+    selects the controller of the step. They are clipped to [-1, 1]; of equal ones, the first counts.
 
     Attributes:
       plan: plans of the simulations.

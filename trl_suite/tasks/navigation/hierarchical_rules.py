@@ -109,7 +109,8 @@ def measure_walker(i: int, data: PlanningData) -> None:
 def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan from the action, relative to the root and its heading, if a footstep begins.
 
-    After the plan, an action has a number for each of several controllers; the largest is selected.
+    After the plan, an action has a number for each of several controllers; the largest selects one, of equal
+    ones the first.
     """
     plan, measurement, ground = data.plan, data.body.measurement, data.body.ground
     if not (data.by_plan or plan.landed[i] or data.clock.steps[i] == 0):
