@@ -35,15 +35,14 @@ FIGURES = {'curves': 'report', 'environments': 'report', 'levels': 'levels'}  # 
 
 def core(found: dict[str, Any]) -> str:
     """Returns the table of the core set; how hard each is follows from the best learner's score."""
-    measured = benchmark.scales()
     rows = []
     for id, course in benchmark.CORE.items():
         low, high = benchmark.ends(id)
         scores = [np.mean(runs, 0)[-1] for of in every(found).values() if (runs := of.get(id))]
         best = f'{max(scores):.2f}' if scores else '–'
         ends = f'{low:.3f}', f'{high:.3f}'
-        rows.append((f'`{id}`', course.description, *ends, measured[id]['episodes'], best))
-    header = 'environment', 'tests', '0 is', '1 is', 'episodes', 'best learner'
+        rows.append((f'`{id}`', course.description, *ends, best))
+    header = 'environment', 'tests', '0 is', '1 is', 'best learner'
     return tables.markdown_table(header, rows)
 
 

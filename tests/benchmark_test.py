@@ -47,7 +47,7 @@ class CoreTest(parameterized.TestCase):
         for of in made['scores'].values():
             self.assertLess(max(of['zero'], of['random']) + 0.1, of['shipped'])
             self.assertLessEqual(of['shipped'], 1)
-            self.assertGreaterEqual(of['episodes'], 16)
+            self.assertGreaterEqual(of['episodes'], 256)
         of = {'zero': 0.1, 'random': 0.2, 'shipped': 0.7}
         with mock.patch.object(core, 'scales', return_value={ID: of}):
             self.assertAlmostEqual(benchmark.normalised(ID, 0.45), 0.5)
