@@ -75,6 +75,7 @@ def of(results: Results, cell: str) -> dict[int, Any]:
 
 # Actions of gaits.
 
+MEASURED = 'distance', 'distance_interval', 'median_distance', 'speed'
 DOG, ACTION_EPISODES = 'FSM_Dog2D_Terrain_Mixed-v0', 100
 ACTIONS = {
     'discrete': 'one of the base actions', 'continuous': 'default gait with changes',
@@ -95,6 +96,7 @@ def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -
 
 CHANGED = 'FSM_Dog2D_Terrain_Narrow_Gaps-v0'
 CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
+    'initial': ('before', {}),
     'selection': ('selection alone', {}),
     'all': ('the same change for all base actions', {'changes': 'all'}),
     'each': ('a change for each base action', {'changes': 'each'}),
@@ -108,9 +110,13 @@ def train_changes(cell: str, seed: int, cycles: float, folder: pathlib.Path) -> 
     shipped, first, own = policies.reference(CHANGED), folder / 'first.npz', CHANGES[cell][1]
     convolution, weights, biases = shipped.networks[0]
     folder.mkdir(parents=True, exist_ok=True)
-    policies.save(
-        dataclasses.replace(shipped, convolution=convolution, weights=weights, biases=biases), first
-    )
+    initial = dataclasses.replace(shipped, convolution=convolution, weights=weights, biases=biases)
+    policies.save(initial, first)
+    if (
+        cell == 'initial'
+    ):  # other episodes for each seed, so that the table shows how much these matter
+        found = evaluation.evaluate(CHANGED, initial, ACTION_EPISODES, SEED + seed, 1)
+        return {**{key: found[key] for key in MEASURED}, 'curve': [[0, found['distance']]]}
     asked = refine_gaits.settings_for(
         CHANGED, start=str(first), samples=cycles, substeps=1, horizon=32, averaged=2e4,
         changes_first=cycles / 4 if own else 0, evaluate_every=cycles / 8, **own,
@@ -121,9 +127,8 @@ def train_changes(cell: str, seed: int, cycles: float, folder: pathlib.Path) -> 
 def measured(id_: str, curve: list[dict[str, Any]], folder: pathlib.Path) -> dict[str, Any]:
     """Returns distances and curve of a training of a gait."""
     found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), ACTION_EPISODES, SEED, 1)
-    keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     points = [[point['samples'], point['distance']] for point in curve if 'distance' in point]
-    return {**{key: found[key] for key in keys}, 'curve': points}
+    return {**{key: found[key] for key in MEASURED}, 'curve': points}
 
 
 def distance_table(names: dict[str, str], id_: str, results: Results, seeds: list[int]) -> str:

@@ -349,6 +349,10 @@ class Learner:
         self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
             self.expert = initial_policy(s.start)
+            if self.expert.biases[-1].shape[-1] > len(self.expert.choices) and not s.actors:
+                raise ValueError(
+                    f'the policy of {self.expert.id} changes its base actions; expected one without changes'
+                )
             self.begin_with(self.expert)
         self.samples = self.updates = 0
         self.renewed = 0  # number of samples when the policy last learnt with a falling rate
@@ -392,10 +396,12 @@ class Learner:
           ValueError: its inputs differ, or it selects among other gaits.
         """
         line, *_ = policy.networks[0]
-        if line is None or not np.array_equal(policy.columns, self.columns):
+        columns = np.arange(policy.observation_size) if policy.columns is None else policy.columns
+        if line is None or not np.array_equal(columns, self.columns):
+            found = 'no convolution' if line is None else f'{len(columns)} inputs'
             raise ValueError(
-                f'the network of {policy.id} has {len(policy.columns)} inputs, that of {self.ids[0]} '
-                f'{len(self.columns)}; expected one that learn_gaits.py trained for the same character '
+                f'the network of {policy.id} has {found}, that of {self.ids[0]} a convolution and '
+                f'{len(self.columns)} inputs; expected one that learn_gaits.py trained for the same character '
                 'with the same setting view'
             )
         known = self.choices[: len(policy.choices)]

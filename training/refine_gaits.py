@@ -44,6 +44,7 @@ from torch.optim import swa_utils
 from trl_suite import policies
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import errors, files
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
 
@@ -151,11 +152,15 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
     """Returns the settings of the simulations.
 
     Raises:
-      ValueError: actors of Q-learning change the base actions, the kind of changes is unknown, or an
-        environment is unknown or has no gait.
+      ValueError: actors of Q-learning change the base actions, the kind of changes is unknown, a number is
+        out of range, or an environment is unknown or has no gait.
     """
     s = settings
     errors.check_known('kind of changes', CHANGES, s.changes)
+    checked('noise', s.noise, float, above=0)
+    checked('largest_change', s.largest_change, float, above=0, at_most=2)
+    if s.changes_first and not s.changes:
+        raise ValueError(f'changes_first is {s.changes_first}; expected 0 without changes')
     if s.first.actors:
         raise ValueError(
             f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
@@ -204,9 +209,11 @@ class Refiner:
         known = initial.biases[-1].shape[-1] - len(initial.choices)
         largest = np.float32(s.largest_change)
         if known and (known, initial.largest_change) != (changes, largest):
+            kind = {size: 'all', count * size: 'each'}.get(known, known)
             raise ValueError(
-                f'{initial.id} has {known} changes of at most {initial.largest_change}; expected '
-                f'{changes} of at most {largest}, as in the settings'
+                f'the policy of {initial.id} has changes={kind!r}, largest_change={initial.largest_change:g}; '
+                f'the settings have changes={s.changes!r}, largest_change={s.largest_change}: expected the '
+                'same, or a policy without changes'
             )
         for number, network in enumerate(networks):
             if changes:
@@ -310,7 +317,7 @@ class Refiner:
         share = min(1.0, self.samples / s.samples)
         rate = s.learning_rate + share * (s.last_learning_rate - s.learning_rate)
         selection, *changes = self.policy_optimizer.param_groups
-        selection['lr'] = rate if self.samples >= s.changes_first else 0.0
+        selection['lr'], frozen = rate, self.samples < s.changes_first
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         for _ in range(s.value_epochs if only_value else s.epochs):
@@ -331,6 +338,9 @@ class Refiner:
                 gain = ppo.clipped_gain(growth.exp(), b['advantage'], s.clip)
                 self.policy_optimizer.zero_grad()
                 (-gain).backward()
+                if frozen:
+                    for parameter in selection['params']:
+                        parameter.grad = None
                 nn.utils.clip_grad_norm_(self.policy.parameters(), s.gradient_norm)
                 self.policy_optimizer.step()
         if changes and learner.updates >= s.value_first:

@@ -1,6 +1,7 @@
 """Actions that could prevent falls: states before falls, and what is counted as prevented."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import evaluate_footsteps
 import foresight
@@ -28,6 +29,27 @@ def falling():
     policy = policies.reference(RAPTOR)
     weights, biases = ((*part[:-1], 0.7 * part[-1]) for part in (policy.weights, policy.biases))
     return dataclasses.replace(policy, weights=weights, biases=biases)
+
+
+class Steps:
+    """Simulations of a point that steps along a line, and falls at some places."""
+
+    def __init__(self, num_envs, falls):
+        self.num_envs, self.falls, self.x, self.tried = num_envs, falls, np.zeros(num_envs), []
+        self.task = SimpleNamespace(
+            world=SimpleNamespace(qpos=self.x[:, None]), body=SimpleNamespace(pose_qpos=[0])
+        )
+
+    def set_state(self, state, env_ids):
+        self.x[env_ids] = state['x']
+
+    def get_state(self, env_ids):
+        return {'x': float(self.x[env_ids[0]])}
+
+    def step(self, action, env_ids):
+        self.tried += [(float(self.x[i]), float(action[i, 0])) for i in env_ids]
+        self.x[env_ids] += action[env_ids, 0]
+        return SimpleNamespace(terminated=np.isin(self.x, self.falls))
 
 
 class OracleTest(absltest.TestCase):
@@ -81,13 +103,24 @@ class OracleTest(absltest.TestCase):
         options = {'autoreset': 'disabled', 'step_limit': None}
         copies, rng = VectorEnvironment(HOPPER, 24, 1, 3, **options), np.random.default_rng(3)
         copies.reset()
-        start = copies.get_state([0])
-        metres, cycles = foresight.search(copies, start, (0.0, 0.1), 9.0, 24 * 50, rng)
-        self.assertBetween(metres, 9.0, 12.0)  # a hop is at most 2.4 m long
-        self.assertBetween(cycles, 24 * 4, 24 * 49)
-        shorter = foresight.search(copies, start, (0.0,), 1e3, 24 * 3, np.random.default_rng(3))
-        self.assertBetween(shorter[0], 3.0, 7.2)
-        self.assertEqual(shorter[1], 24 * 3)
+        start, base = copies.get_state([0]), policies.reference(HOPPER).choices
+        for noisy in (False, True):
+            metres, cycles = foresight.search(copies, start, base, noisy, 9.0, 24 * 50, rng)
+            self.assertBetween(metres, 9.0, 12.0)  # a hop is at most 2.4 m long
+            self.assertBetween(cycles, 4 * len(base), 24 * 49)
+        shorter = foresight.search(copies, start, base, True, 1e3, 48, np.random.default_rng(3))
+        self.assertBetween(shorter[0], 2.0, 7.2)
+        self.assertEqual(shorter[1], 48)
+
+    def test_a_search_finds_the_only_way(self):
+        """Steps of 2 or 3 m; all that get beyond 7 m have landed on 4 m. Others are dead ends."""
+        world = Steps(8, falls=(3, 5, 6, 8))
+        found = foresight.search(world, {'x': 0}, np.array([[2.0], [3.0]]), False, 11, 1000, None)
+        self.assertGreaterEqual(found[0], 11)
+        self.assertLen(set(world.tried), len(world.tried))  # each state tries each action once
+        world = Steps(8, falls=(4, 5, 6, 8))
+        found = foresight.search(world, {'x': 0}, np.array([[2.0], [3.0]]), False, 11, 1000, None)
+        self.assertEqual(found, (3, 6))  # 0, 2 and 3 have tried both: no state is left
 
     def test_a_tracking_policy_falls_again_without_noise(self):
         """Noise prevents a fall if the character gets beyond its place, before or after its time."""

@@ -57,6 +57,9 @@ class RefineTest(FolderTest):
     @parameterized.parameters(
         ({'first': dataclasses.replace(FIRST, action='both')}, "action.*'both'; expected 'discrete'"),
         ({'changes': 'every'}, "unknown kind of changes 'every'"),
+        ({'changes': 'all', 'noise': 0.0}, 'noise is 0.0; expected a number above 0'),
+        ({'changes': 'all', 'largest_change': -0.3}, 'largest_change is -0.3'),
+        ({'changes_first': 8.0}, 'changes_first is 8.0; expected 0 without'),
         ({'also': ('FSM_Hoper2D_*',)}, 'did you mean'),
         ({'also': ('PD_Biped2D_Gaps_Terrain-v0',)}, 'no gait'),
         ({}, 'PD_Biped2D_Flat-v0 has no gait', 'PD_Biped2D_Flat-v0'),
@@ -147,7 +150,9 @@ class RefineTest(FolderTest):
         again = refine_gaits.Refiner(HOPPER, 1, refiner.settings, 1, policy)
         np.testing.assert_array_equal(again.exported()(observation), policy(observation))
         other = dataclasses.replace(refiner.settings, largest_change=0.2)
-        with self.assertRaisesRegex(ValueError, 'of at most 0.3.*; expected .* of at most 0.2'):
+        with self.assertRaisesRegex(
+            ValueError, f"changes='{changes}', largest_change=0.3; .* largest_change=0.2"
+        ):
             refine_gaits.Refiner(HOPPER, 1, other, 1, policy)
 
     def test_training_may_have_a_coarser_physics(self):
