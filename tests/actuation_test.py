@@ -148,7 +148,18 @@ class ActionMapTest(parameterized.TestCase):
         )
         with self.assertRaisesRegex(ValueError, "'mine' has no muscles.*biped2d.*dog.*raptor"):
             actuation.add(characters.make(spec), 'muscle', TIMESTEP)
-        self.assertLen(actuation.add(characters.make(spec), 'position', TIMESTEP), 6)
+        character = characters.make(spec)
+        for model, options, message in (
+            ('position', {'action_scal': 0.5}, "unknown option of position control 'action_scal'; did you mean"),
+            ('torque', {'action_scale': 0.5}, "unknown option of torque control 'action_scale'"),
+            ('position', {'action_scale': -1}, 'action_scale is -1.*; expected positive numbers'),
+            ('position', {'action_offset': 0.0}, r'action_offset has shape \(\).*; expected \(6,\)'),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(ValueError, message):
+                actuation.add(character, model, TIMESTEP, **options)
+        self.assertLen(
+            actuation.add(character, 'position', TIMESTEP), 6
+        )  # nothing was added before
 
     def test_a_slide_without_limits_needs_a_range(self):
         character = characters.make('hopper')

@@ -87,7 +87,7 @@ REFUSED = (  # environment, options
     (PLANAR, {'flex_damping': 0.1}, 'no effect without flex'),
     (PLANAR, {'braking': 2.0}, 'no effect without torque_speed'),
     (PLANAR, {'torque_pose': 'no such file.json'}, 'cannot read the table'),
-    (PLANAR, {'torque_pose': 3}, 'expected True'),
+    (PLANAR, {'torque_pose': 3}, 'expected True'), (PLANAR, {'torque_pose': {}}, 'expected True'),
     (PLANAR, {'torque_pose': {'right_nee': {}}}, "did you mean 'right_knee'"),
     (PLANAR, {'torque_pose': {'right_knee': {'angle': [0, 1]}}}, 'angle, positive, negative'),
     (PLANAR, {'torque_pose': {'right_knee': {'angle': [0, 0], 'positive': [1, 1], 'negative': [1, 1]}}}, 'ascending order'),

@@ -221,6 +221,14 @@ class EvaluateTest(parameterized.TestCase):
         found = evaluation.evaluate(FLAT, make(blind), 2, task_kwargs={'terrain_observation': 0})
         self.assertEqual(found['returns'], expected['returns'])
 
+    def test_seeds_may_be_an_array(self):
+        policy, options = make(GAPS), {'step_limit': 3}
+        found = [
+            evaluation.evaluate(GAPS, policy, 2, s, 1, options) for s in ([3, 5], np.array([3, 5]))
+        ]
+        self.assertEqual(found[0], found[1])
+        self.assertIsNone(found[1]['seed'])
+
     def test_invalid_arguments_are_rejected(self):
         policy = make(GAPS)
         for message, *arguments in (

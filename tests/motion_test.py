@@ -542,6 +542,10 @@ class ReaderTest(FolderTest):
             ('', ''), ('[1, 2', ''), ('{"Frames": [}', ''), ('[]', ''), ('\ufeff', ''),
             (b'\xff\xfe\x00\x01', 'not text in UTF-8: .* at byte 0'),
         )  # fmt: skip
+        deep = (0.1, 0, 1, 0, 0.2, 0.3)
+        others += (
+            ({'Motion': {'Frames': [deep] * 2}}, 'frame 0 has 6 numbers; expected 5, for 1 joints'),
+        )
         for content, message in (*(({'Frames': f}, message) for f, message in frames), *others):
             assert_refused(self, (lambda c=content: self.read(c), f'walk.txt: {message}'))
         ball = (*good[:8], 0.3, 1, 0, 0, 0)

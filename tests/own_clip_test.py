@@ -404,6 +404,17 @@ class CycleTest(parameterized.TestCase):
             self.assertAlmostEqual(cycles, round(cycles), delta=0.03, msg=name)
             self.assertAlmostEqual(clip.speed, source.speed, delta=0.05 * source.speed)
 
+    def test_the_period_is_found_in_a_long_clip(self):
+        """Of ten minutes, of which only the last seconds repeat; frames are 0.04 s apart."""
+        t = np.arange(0, 600, 0.04)
+        knee = np.where(t < 590, 0.5 * t, np.sin(2 * np.pi * t / 1.2))
+        clip = motion.Clip('long', t, np.c_[t, 1 + 0 * t, 0 * t, knee], 'planar', ('knee',), (1,))
+        found = retargeting.cycle(clip)
+        self.assertAlmostEqual(found.duration, round(found.duration / 1.2) * 1.2, delta=0.03)
+        self.assertGreater(np.ptp(found.poses[:, 3]), 1.9)
+        with self.assertRaisesRegex(ValueError, 'loops already'):
+            retargeting.cycle(found)
+
     def test_a_somersault_stays_one(self):
         t = np.linspace(0, 3, 91)
         poses = np.stack([t, 1 + 0.1 * np.sin(2 * np.pi * t), 2 * np.pi * t], 1)

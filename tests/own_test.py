@@ -20,6 +20,7 @@ import trimesh
 from absl.testing import parameterized
 from helpers import FolderTest, assert_refused, assert_rows_are_singles, in_this_process
 from helpers import ground as heights_at
+from PIL import Image
 
 from trl_suite import characters, cli, engine, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
@@ -716,6 +717,7 @@ class TerrainTest(WrittenTest):
         box.export(f / 'away.stl')
         self.write('nothing', 'broken.obj')
         self.write('nothing', 'broken.png')
+        Image.fromarray(np.array([[0, -3], [5, 7]], np.int32)).save(f / 'signed.tif')
         self.write('v -1 -1\nv 1 -1\nv 0 1\nf 1 2 3\n', 'plane.obj')
         terrain.from_function(lambda x: x, 'wedge')
         cliff = terrain.from_function(lambda x: 1e300 * np.sign(x - 0.4), 'cliff')
@@ -725,6 +727,10 @@ class TerrainTest(WrittenTest):
             (lambda: terrain.from_function(lambda x: x), 'has no name; pass name='),
             (lambda: terrain.from_function(np.abs, 'var2d_gaps'), 'exists; pass replace'),
             (lambda: terrain.from_function(lambda x: 2 * x, 'wedge'), 'exists; pass'),
+            (lambda: terrain.from_function(lambda x, y: 0 * x, 'wedge'), 'exists and is planar; choose another name'),
+            (lambda: terrain.from_function(np.abs, 'hills3d', replace=True), 'exists and is three-dimensional'),
+            (lambda: terrain.from_heights(['0', '1'], 1), 'heights: expected an array of numbers: the type is <U1'),
+            (lambda: terrain.from_image(f / 'signed.tif', 1), 'signed.tif: .*mode I, .*expected 8 or 16 bits'),
             (lambda: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),
             (lambda: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
             (lambda: terrain.PlanarGround(hole, 0).height(5.0), "terrain 'hole' returned nan at x = 3.* m; expected"),

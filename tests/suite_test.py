@@ -263,4 +263,7 @@ class BuildTest(parameterized.TestCase):
         spec = dataclasses.replace(suite.find('PD_Biped3D_Imitate-v0'), terrain='gaps')
         assert_refused(self, (
             lambda: suite.build_task(spec), "'biped3d' is three-dimensional and terrain 'gaps'"
+        ), (
+            lambda: suite.build_task(suite.find('PD_Biped2D_Flat-v0'), {'step_limit': 5}),
+            'step_limit is an option of the environment',
         ))  # fmt: skip

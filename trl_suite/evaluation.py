@@ -22,7 +22,7 @@ from trl_suite.environments.named_policies import BatchPolicy
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.util import machine
+from trl_suite.util import errors, machine
 from trl_suite.util.options import checked
 
 MOST_EPISODES = 1_000_000
@@ -70,7 +70,7 @@ def evaluate(
       episodes: number of episodes, at most `MOST_EPISODES`.
       seed: seed of the whole evaluation; or a sequence with one seed per episode.
       num_threads: threads that step the physics; 0 uses all cores, with an executor 1.
-      task_kwargs: options of the task, as for `suite.load` (without seed and limits).
+      task_kwargs: options of the task, as for `suite.load`, with limits, but without seed.
       factory: `policy` is a function `VectorEnvironment` -> policy, so that the policy can use more
         than observations; the values of `named_policies.BASELINES` are such functions.
       progress: show a progress bar, in steps up to the step limit, with an executor in parts of
@@ -83,8 +83,8 @@ def evaluate(
       'step_limit'. Summary: 'return' (mean),
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
       standard errors; None for a single episode), 'normalized_return' (mean return over the step
-      limit; the reward of a step is at most 1), 'completion_rate' (share of episodes that last
-      until the step limit), 'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its
+      limit; the reward of a step is at most 1), 'completion_rate' (share of episodes that
+      reach a limit without a failure), 'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its
       95 % confidence interval from `BOOTSTRAP` bootstrap samples of the episodes, [m, m], since
       distances are far from normally distributed; None for a single episode), 'median_distance'
       (m), 'speed' (total distance over total time, m/s), 'falls' and 'diverged' (shares of
@@ -120,6 +120,7 @@ def evaluate_all(
     Arguments, results and errors are those of `evaluate`.
     """
     seeds = _seeds(episodes, seed)
+    task_kwargs = errors.options('task_kwargs', task_kwargs)  # here, where paths are relative to
     size = CHUNK if executor is None else PART
     parts = [seeds[start : start + size] for start in range(0, len(seeds), size)]
     run = functools.partial(
@@ -219,7 +220,7 @@ def _summary(
     return {
         'id': id_,
         'episodes': len(seeds),
-        'seed': None if isinstance(seed, Sequence) else int(seed),
+        'seed': None if np.ndim(seed) else int(np.asarray(seed)),
         'step_limit': step_limit,
         'return': mean,
         'return_interval': interval,

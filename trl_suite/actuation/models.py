@@ -17,6 +17,7 @@ servos, which MuJoCo clamps axis by axis, get that limit / sqrt(3) about each ax
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -120,7 +121,7 @@ def original_ranges(character: Character) -> np.ndarray:
     return np.where(free[:, None], (-np.pi, np.pi), ranges)
 
 
-def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap:
+def _add_torque(character: Character, timestep: float) -> ActionMap:
     limits = character.torque_limits
     _prepare(character, timestep, limits / DAMPING_DIVISOR)
     each = _spread(character, limits)
@@ -135,7 +136,7 @@ def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap
     return ActionMap(names, 'torque', unit, np.zeros(len(names)), scale * each, names, balls)
 
 
-def _add_velocity(character: Character, timestep: float, **_: object) -> ActionMap:
+def _add_velocity(character: Character, timestep: float) -> ActionMap:
     limits, ball = character.torque_limits, character.spherical
     kd = np.array([joint.kd for joint in character.spec.joints.values()])
     passive, least, clamps = np.zeros(len(limits)), None, limits
@@ -168,9 +169,17 @@ def _add_position(
     action_offset: Sequence[float] | np.ndarray | None = None,
     action_scale: float | Sequence[float] | np.ndarray | None = None,
     rotations: str = 'vector',
-    **_: object,
 ) -> ActionMap:
     errors.check_known('description of rotations', ROTATIONS, rotations)
+    if rotations == 'angle_axis':
+        if action_offset is not None or action_scale is not None:
+            raise ValueError(
+                "rotations='angle_axis' has the original's scaling; do not pass action_offset or "
+                'action_scale'
+            )
+        action_map = _angle_axis(character)
+    else:
+        action_map = _position_map(character, action_offset, action_scale)
     limits = character.torque_limits
     joints = list(character.spec.joints.values())
     kd = np.array([joint.kd for joint in joints])
@@ -187,14 +196,12 @@ def _add_position(
             add('orientation', forcerange=(0, limit), **common)
         else:
             add('position', ctrllimited=False, forcerange=(-limit, limit), **common)
-    if rotations == 'angle_axis':
-        if action_offset is not None or action_scale is not None:
-            raise ValueError(
-                "rotations='angle_axis' has the original's scaling; do not pass action_offset or "
-                'action_scale'
-            )
-        return _angle_axis(character)
-    names = _split(character, 'xyz')
+    return action_map
+
+
+def _position_map(character: Character, action_offset: Any, action_scale: Any) -> ActionMap:
+    """Returns the map of actions to target angles, and to rotation vectors of ball joints."""
+    joints, names = list(character.spec.joints.values()), _split(character, 'xyz')
     if action_offset is None:
         targets = [
             np.broadcast_to(j.target, n) for j, n in zip(joints, character.dofs, strict=True)
@@ -209,11 +216,14 @@ def _add_position(
         turn = np.minimum(POSITION_SCALE, original)
         action_scale = _spread(character, np.where(character.prismatic, slide, turn))
     scale = errors.floats(f'action_scale of {character.spec.name!r}', action_scale)
-    fits = middle.shape == (len(names),) and scale.shape in ((), (1,), (len(names),))
-    if not fits or not np.all(scale > 0):
+    if middle.shape != (len(names),) or scale.shape not in ((), (1,), (len(names),)):
         raise ValueError(
-            f'position control of {character.spec.name!r}: action_scale must be positive, and '
-            f'action_offset and action_scale broadcast to ({len(names)},)'
+            f'position control of {character.spec.name!r}: action_offset has shape {middle.shape}, '
+            f'action_scale {scale.shape}; expected ({len(names)},), and for action_scale also a number'
+        )
+    if not np.all(scale > 0):
+        raise ValueError(
+            f'position control of {character.spec.name!r}: action_scale is {scale}; expected positive numbers'
         )
     quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')
@@ -241,9 +251,7 @@ def _angle_axis(character: Character) -> ActionMap:
     return ActionMap(names, quantity, unit, action_offset, action_scale, actuators, balls)
 
 
-def _add_muscle(
-    character: Character, timestep: float, muscle_set: str = PLAIN, **_: object
-) -> ActionMap:
+def _add_muscle(character: Character, timestep: float, muscle_set: str = PLAIN) -> ActionMap:
     units = character_muscles(character, muscle_set)
     _prepare(character, timestep, character.torque_limits / MUSCLE_DAMPING_DIVISOR)
     joints = dict(zip(character.spec.joints, character.joints, strict=True))
@@ -301,4 +309,6 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
     """
     errors.check_known('actuation', ACTUATIONS, model)
     checked('timestep', timestep, float, 's', above=0)
+    known = [*inspect.signature(_MODELS[model]).parameters][2:]
+    errors.check_known(f'option of {model} control', known, *options)
     return _MODELS[model](character, timestep, **options)

@@ -107,7 +107,7 @@ def load(given: Any, character: CharacterSpec) -> dict[str, Curves]:
     if isinstance(given, (str, pathlib.Path)):
         with errors.naming('torque_pose: cannot read the table', (OSError, ValueError)):
             given = files.read_json(given)
-    if not isinstance(given, Mapping):
+    if not isinstance(given, Mapping) or not given:
         raise ValueError(
             f"torque_pose is {given!r}; expected True, 'human', a JSON file, or a table by joint"
         )

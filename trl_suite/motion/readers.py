@@ -83,6 +83,10 @@ def read_terrainrl(
     frames = _frames(path, motion, head)
     if head is _PLANAR_ROOT:
         duration, x, y, angle = frames[:, : len(head)].T
+        if (count := frames.shape[1]) != (needed := len(head) + sum(sizes)):
+            raise ValueError(
+                f'{path}: frame 0 has {count} numbers; expected {needed}, for {len(joints)} joints'
+            )
         zero = np.zeros_like(x)
         full = (duration, x, y, zero, np.cos(angle / 2), zero, zero, np.sin(angle / 2))
         frames = np.column_stack([*full, frames[:, len(head) :]])

@@ -145,7 +145,7 @@ class FootstepLibrary:
         return _mirrored(mirrored, self._blend(index, t, mirrored), self.layout.mirror.pose)
 
     def velocity(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends."""
+        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends; beyond them, those of the ends."""
         which, time, mirrored = np.broadcast_arrays(index, np.asarray(t, dtype=float), mirrored)
         time = np.clip(time, 0, self.duration)
         start = np.maximum(time - VELOCITY_STEP / 2, 0)

@@ -85,6 +85,11 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     common = variation.CommonOptions.parse(spec.id, shared)
     realism.check(common.actuators, spec.actuation)
     type_, config_type = task_type(spec), config_of(spec)
+    for name in ('step_limit', 'time_limit', 'random'):
+        if name in given:
+            raise ValueError(
+                f'{name} is an option of the environment; expected options of the task'
+            )
     others = (*names, 'step_limit', 'time_limit', 'random')
     if config_type is None:
         known, config = task_options(spec), None

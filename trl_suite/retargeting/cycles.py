@@ -9,7 +9,7 @@ import numpy as np
 from trl_suite.motion import Clip
 
 CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
-CYCLE_FRAMES = 300  # largest number of frames in the search for a cycle
+MOST = 300  # starts, and ends for each, that are compared at a time
 RATE_TIME = 0.1  # s; weight of a difference of velocities against one of poses
 
 
@@ -26,8 +26,10 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
       end: end of the cycle, s.
 
     Raises:
-      ValueError: times that are not in the clip, one without the other, or a clip that is too short.
+      ValueError: a clip that loops or is too short, times that are not in it, or one without the other.
     """
+    if clip.loop:
+        raise ValueError(f'clip {clip.name!r} loops already; expected one that does not')
     if (start is None) is not (end is None):
         raise ValueError('start and end: expected both or none')
     if start is None or end is None:
@@ -62,17 +64,24 @@ def _alike(clip: Clip) -> tuple[float, float]:
             f'clip {clip.name!r} lasts {clip.duration:.3g} s; expected at least {CYCLE[0]} s, or the '
             'times of the cycle'
         )
-    count = min(CYCLE_FRAMES, max(len(clip.times), 30))
-    times = np.linspace(0, clip.duration, count)
-    poses, rates = clip.pose(times), RATE_TIME * clip.velocity(times)
-    flat = 1 if clip.root == 'planar' else 2
-    best = (np.inf, 0.0, 0.0)
-    for i, time in enumerate(times):
-        later = np.flatnonzero((times >= time + CYCLE[0]) & (times <= time + CYCLE[1]))
-        if not len(later):
-            break
-        change = _change(clip, np.broadcast_to(poses[i], poses[later].shape), poses[later])
-        difference = (change[:, flat:] ** 2).sum(1) + ((rates[later] - rates[i]) ** 2).sum(1)
-        j = int(difference.argmin())
-        best = min(best, (float(difference[j]), time, times[later[j]]))
-    return float(best[1]), float(best[2])
+    frame = float(np.median(np.diff(clip.times)))
+    last, flat = clip.duration - CYCLE[0], 1 if clip.root == 'planar' else 2
+    lengths = np.linspace(*CYCLE, min(MOST, 1 + round((CYCLE[1] - CYCLE[0]) / frame)))
+
+    def best(low: float, high: float) -> tuple[float, float, float]:
+        """Returns start and end of the best cycle that starts between two times, and their distance."""
+        starts = np.linspace(low, high, max(2, min(MOST, 1 + round((high - low) / frame))))
+        found = (np.inf, 0.0, 0.0)
+        for start in starts:
+            times = start + np.append(0, lengths[start + lengths <= clip.duration + 1e-9])
+            poses, rates = clip.pose(times), RATE_TIME * clip.velocity(times)
+            change = _change(clip, np.broadcast_to(poses[0], poses[1:].shape), poses[1:])
+            difference = (change[:, flat:] ** 2).sum(1) + ((rates[1:] - rates[0]) ** 2).sum(1)
+            j = int(difference.argmin())
+            found = min(found, (float(difference[j]), start, times[1 + j]))
+        return found[1], found[2], starts[1] - starts[0]
+
+    start, end, apart = best(0.0, last)
+    if apart > frame:  # of a long clip
+        start, end, _ = best(max(0.0, start - apart), min(last, start + apart))
+    return float(start), float(min(end, clip.duration))

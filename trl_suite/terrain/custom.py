@@ -27,7 +27,14 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain import mesh
-from trl_suite.terrain.generators import START_SPAN, Parameters, register3d, register_line
+from trl_suite.terrain.generators import (
+    GENERATORS,
+    GENERATORS3D,
+    START_SPAN,
+    Parameters,
+    register3d,
+    register_line,
+)
 from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util import errors
@@ -133,6 +140,12 @@ def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
 
 
 def _register(name: str, function: Any, arguments: int, replace: bool = True) -> None:
+    if name in (GENERATORS3D if arguments == 1 else GENERATORS):
+        kinds = 'planar', 'three-dimensional'
+        raise ValueError(
+            f'terrain type {name!r} exists and is {kinds[arguments == 1]}; choose another name for one that '
+            f'is {kinds[arguments - 1]}'
+        )
     if arguments == 1:
         register_line(name, function, replace=replace)
         return
@@ -296,8 +309,13 @@ def _pixels(file: pathlib.Path) -> np.ndarray:
                 )
             if picture.mode == 'P':
                 return np.asarray(picture.convert(picture.palette.mode))
-            # Some versions of Pillow widen the 16 bits of a .png.
+            # Some versions of Pillow widen the 16 bits of a .png; those of a .tif may have a sign.
             widened = kind == 'PNG' and picture.mode == 'I'
+            if picture.mode in ('I', 'F') and not widened:
+                raise ValueError(
+                    f'pixels have mode {picture.mode}, signed, wide or real numbers; expected 8 or 16 bits '
+                    'without sign. For elevations in m, read them with another library and use from_heights'
+                )
             return np.asarray(picture.convert('I;16') if widened else picture)
     except Exception as error:  # of the reader's own kinds
         raise ValueError(f'{file}: cannot be read as {kind} ({error})') from None
