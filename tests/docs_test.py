@@ -91,7 +91,7 @@ class PagesTest(FolderTest):
 
     @parameterized.parameters(
         'README', 'CONTRIBUTING', 'docs/quick_start', 'docs/concepts', 'docs/guide', 'docs/realism',
-        'docs/reports/robustness',
+        'docs/reports/robustness', 'docs/benchmark',
     )  # fmt: skip
     def test_code_runs(self, name):
         text = (ROOT / f'{name}.md').read_text(encoding='utf-8')
