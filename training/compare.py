@@ -273,9 +273,9 @@ def limit_table(results: Results, seeds: list[int]) -> str:
         )
         values = [each['normalized_return'] for each in done.values()]
         text = f'{np.mean(values):.2f}' if values else '–'
-        return text + (f' ± {np.std(values):.2f}' if len(values) > 1 else '')
+        return text + (f' ± {np.std(values, ddof=1):.2f}' if len(values) > 1 else '')
 
-    title = f'Return divided by its maximum, mean over {LIMIT_EPISODES} episodes:'
+    title = f'Return divided by its maximum, mean over {LIMIT_EPISODES} episodes; ± standard deviation of the seeds:'
     rows = ([limits, *(cell(model, limits) for model in MODELS)] for limits in LIMITS)
     return f'{title}\n\n{tables.markdown_table(["torque limits", *MODELS], rows)}'
 
@@ -313,6 +313,14 @@ COMPARISONS = {
 }  # fmt: skip
 
 
+def described(compared: Comparison, found: dict[str, Any]) -> str:
+    """Returns the content of a JSON file as Markdown."""
+    seeds = sorted({int(key.rsplit('/', 1)[1]) for key in found['results']})
+    unit = compared.axis.partition(',')[0]
+    text = f'After {found["samples"]:,.0f} {unit}, seeds {", ".join(map(str, seeds))}. '
+    return text + compared.table(found['results'], seeds)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('comparison', choices=COMPARISONS)
@@ -342,10 +350,7 @@ def main() -> None:
             found['results'][f'{cell}/{seed}'] = compared.job(cell, seed, samples, folder)
             path.parent.mkdir(parents=True, exist_ok=True)
             files.write_json(found, path)
-    seeds = sorted({int(key.rsplit('/', 1)[1]) for key in found['results']})
-    unit = compared.axis.partition(',')[0]
-    text = f'After {samples:,.0f} {unit}, seeds {", ".join(map(str, seeds))}. '
-    print(text := text + compared.table(found['results'], seeds))
+    print(text := described(compared, found))
     if arguments.picture is not None:
         pages.curves(arguments.picture, compared.panels(found['results']), compared.axis)
     if arguments.page is not None:

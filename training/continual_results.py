@@ -16,12 +16,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from pages import DOCS, picture, table
+from pages import DOCS, picture
 from scipy import special
 
 from trl_suite import sequences
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
+from trl_suite.util.tables import markdown_table as table
 
 FOLDER = DOCS / 'continual'
 LEARNERS = ('Scratch', 'FineTuning', 'EWC', 'Plaid', 'MultiTask')  # the order of tables and colours

@@ -18,16 +18,18 @@ import numpy as np
 import oracles
 import runs
 import train_all
-from pages import DOCS, picture, table
+from pages import DOCS, picture
 
 from trl_suite import policies
 from trl_suite.registry import catalogue, terrainrl
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
+from trl_suite.util.tables import markdown_table as table
 
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
 MILESTONES = (0.5, 0.8, 0.9)  # fractions of the maximum return
 PANELS = {'hierarchical': 'plans', 'flat_control': 'without hierarchy'}  # else by character
+PICTURE = DOCS / 'learning_curves.png'
 LONGEST = 20  # ratio of longest to shortest run in a panel above which its x axis is logarithmic
 GENERALISTS = 'specialists', 'distilled', 'trained', 'averaged'  # keys of generalist/ID.json
 Rows = Iterator[list[str]]
@@ -327,7 +329,7 @@ def plot(entries: dict[str, dict[str, Any]]) -> None:
             name = next((name for tag, name in PANELS.items() if tag in spec.tags), spec.character)
             panels.setdefault((spec.domain, name), []).append(id_)
     rows = -(-len(panels) // 3)
-    with picture(DOCS / 'learning_curves.png', rows, 3, figsize=(13, 4.2 * rows), sharey=True) as (
+    with picture(PICTURE, rows, 3, figsize=(13, 4.2 * rows), sharey=True) as (
         _,
         axes,
     ):

@@ -21,6 +21,7 @@ import networks
 import numpy as np
 import ppo
 import ppo_learner
+import results
 import runs
 import settings
 import share_gaits
@@ -572,6 +573,25 @@ class PlannerTransferTest(absltest.TestCase):
         given = ('PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_Stand_Step-v0', '--each')
         with self.assertRaisesRegex(ValueError, '--each has one controller; expected at least two'):
             output(transfer_planners.main, *given)
+
+
+class StoredPagesTest(parameterized.TestCase):
+    """Pages equal what their programs make of the stored results: run these if a test fails."""
+
+    def test_results(self):
+        self.assertEqual(
+            results.page(results.load()), (results.DOCS / 'results.md').read_text('utf-8')
+        )
+
+    @parameterized.parameters(
+        ('actions', 'gait_actions', 'terrain_adaptive_gaits'), ('hierarchy', 'hierarchy', 'deeploco'),
+        ('limits', 'limits', 'robustness'),
+    )  # fmt: skip
+    def test_comparisons(self, name, stored, page):
+        found = files.read_json(results.DOCS / f'data/{stored}.json')
+        text = (results.DOCS / f'reports/{page}.md').read_text('utf-8')
+        block = compare.described(compare.COMPARISONS[name], found)
+        self.assertEqual(files.between(text, name, 'training/compare.py', block), text)
 
 
 class PageTest(FolderTest):

@@ -92,7 +92,7 @@ def _cell(value: object) -> str:
 
 def _numeric(columns: Iterable[Sequence[str]]) -> list[bool]:
     """Returns which columns have only numbers below their titles, or dashes for missing ones."""
-    number = re.compile(r'([-+]?\d[-+.\de%]*|–)?')
+    number = re.compile(r'([-+]?\.?\d[-+.\de%±(),/ ]*|–)?')
     return [all(number.fullmatch(cell) for cell in column[1:]) for column in columns]
 
 
