@@ -119,7 +119,10 @@ def costs(titles: list[str]) -> None:
 
 def effects(episodes: int) -> None:
     """Evaluates shipped policies with each option at three strengths."""
-    result: dict[str, object] = {'episodes': episodes}
+    stored = files.read_json(RESULTS).get('effects', {}) if RESULTS.exists() else {}
+    if stored.get('episodes') != episodes:
+        stored = {}
+    result: dict[str, object] = {**stored, 'episodes': episodes}
     for title, id_ in EFFECT_IDS.items():
         policy = policies.reference(id_)
         ideal = evaluation.evaluate(id_, policy, episodes)['return']

@@ -32,6 +32,7 @@ from trl_suite.engine import World
 from trl_suite.terrain import PlanarGround, SpatialGround
 from trl_suite.terrain.spatial.layout import Layout
 from trl_suite.util import files
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -112,6 +113,7 @@ def main() -> None:
     parser.add_argument('--repeats', type=int, default=30)
     parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
     arguments = parser.parse_args()
+    checked('--resets', arguments.resets, int, at_least=1, at_most=arguments.num_envs)
     figures = {}
     for id_ in tqdm.tqdm(arguments.ids):
         found = measure(id_, arguments.num_envs, arguments.resets, arguments.repeats)

@@ -166,7 +166,8 @@ def table(found: dict[str, Any]) -> str:
     )
     # An unfinished run has cells that not all seeds have.
     keys = [
-        {(id_, key) for id_, row in rows.items() for key in row} for rows in found['seeds'].values()
+        {(id_, key) for id_, row in rows.items() for key in row if key != 'of'}
+        for rows in found['seeds'].values()
     ]
     every, any_ = len(set.intersection(*keys)), len(set.union(*keys))
     partly = '' if every == any_ else f' ({any_ - every} of {any_} cells: fewer seeds)'

@@ -31,6 +31,7 @@ from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks.variation import pushes, sensors, worlds
 from trl_suite.util import errors, files, tables
+from trl_suite.util.program import begin_script
 from trl_suite.util.tables import markdown_table as table
 
 DOCS = pathlib.Path(__file__).resolve().parent
@@ -207,7 +208,8 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     if not found:
         return ''
     run = gallery.shipped_run(found)
-    result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
+    result, samples = gallery.evaluation(spec.id), run['curve'][-1]['samples']
+    taken = run['shipped_at']
     settings, unit = run['settings'], task_type(spec).samples
     first = settings.get('first', settings)
     begin = settings if settings.get('start') else first
@@ -592,4 +594,5 @@ def main() -> int:
 
 
 if __name__ == '__main__':
+    begin_script()
     sys.exit(main())

@@ -1,7 +1,6 @@
 """Prioritised level replay: PPO trains most on the levels whose values it predicts worst.
 
-Jiang, Grefenstette & Rocktäschel: Prioritized Level Replay. ICML 2021. Needs
-`pip install 'trl_suite[benchmark]'`.
+Jiang et al.: Prioritized Level Replay. ICML 2021. Needs `pip install 'trl_suite[benchmark]'`.
 """
 
 import argparse

@@ -515,6 +515,14 @@ class HookTest(parameterized.TestCase):
         environment.reset()
         data = environment.physics.data
         self.assertAlmostEqual(data.geom_xpos[-1, 2], 7)
+        root = environment.task.body.pose_qpos
+
+        def raised(physics, random_state):
+            physics.data.qpos[root[1]] += 0.25
+
+        before = environment.reset().observation['pose'][0]
+        environment.add_extra_hook('initialize_episode', raised)
+        self.assertAlmostEqual(environment.reset().observation['pose'][0], before + 0.25, delta=0.1)
 
     def prop(self, **methods):
         """An entity with other methods."""

@@ -566,8 +566,10 @@ def _train(
                 trainer.evaluate(folder, divergence)
                 trainer.seconds['evaluation'] += time.perf_counter() - end
                 trainer.save(folder)
+    # A stage that one update has passed has no policy of its own.
     earlier = range(trainer.current - settings.stages_averaged + 1, trainer.current)
-    parts = [policies.load(folder / f'stage_{i}.npz') for i in earlier]
+    stages = [folder / f'stage_{i}.npz' for i in earlier]
+    parts = [policies.load(path) for path in stages if path.exists()]
     policies.save(mean_of([*parts, trainer.exported()]), folder / 'last.npz')
     return trainer.curve
 

@@ -102,7 +102,7 @@ def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
                     os.link(folder / name, linked)
             try:
                 put(pathlib.Path(moment), url)
-            except OSError as error:  # training continues; the next copy may succeed
+            except Exception as error:  # of any file system; the next copy may succeed
                 print(f'{url}: {error}', file=sys.stderr)
             else:
                 before = now

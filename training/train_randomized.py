@@ -114,14 +114,13 @@ def main() -> None:
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
     errors.check_known('environment', RANDOMIZED, *arguments.ids)
-    entries = []
     for id_ in tqdm.tqdm(arguments.ids, unit='run'):
         if arguments.overwrite:
             runs.remove(arguments.runs / id_ / f'seed_{arguments.seed}')
         if arguments.overwrite or not runs.place(place(id_)).exists():
             train(id_, arguments.seed, arguments.runs)
-        entries.append(measure(id_))
-    text = table(entries)
+        measure(id_)
+    text = table([measure(id_) for id_ in RANDOMIZED if runs.place(place(id_)).exists()])
     print(text)
     if arguments.page is not None:
         files.replace_between(arguments.page, 'randomized', 'training/train_randomized.py', text)

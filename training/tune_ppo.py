@@ -20,7 +20,9 @@ from ray.tune import schedulers
 from ray.tune.search.basic_variant import BasicVariantGenerator
 from settings import settings_for
 
+from trl_suite import suite
 from trl_suite.adapters.ray import connect
+from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
 SPACE = {
@@ -59,6 +61,9 @@ def main(words=None):
     parser.add_argument('--runs', default='runs/tune', help='folder, or URL of fsspec')
     parser.add_argument('--address', help="of Ray: 'auto', or HOST:PORT")
     chosen = parser.parse_args(words)
+    id_ = suite.find(chosen.id).id
+    checked('--trials', chosen.trials, int, at_least=1)
+    checked('--samples', chosen.samples, float, above=0)
     if not ray.is_initialized():
         connect(chosen.address)
     search = BasicVariantGenerator(random_state=chosen.seed)
@@ -68,7 +73,7 @@ def main(words=None):
     )  # fmt: skip
     runs = storage.absolute(chosen.runs)
     function = tune.with_parameters(
-        trial, id_=chosen.id, samples=chosen.samples, seed=chosen.seed, runs=runs
+        trial, id_=id_, samples=chosen.samples, seed=chosen.seed, runs=runs
     )
     found = tune.Tuner(
         tune.with_resources(function, {'cpu': 1}),
@@ -81,7 +86,8 @@ def main(words=None):
             failure_config=tune.FailureConfig(max_failures=10),
         ),
     ).fit()  # fmt: skip
-    for result in sorted(found, key=lambda result: -result.metrics[SCORE]):
+    done = [result for result in found if result.metrics and SCORE in result.metrics]
+    for result in sorted(done, key=lambda result: -result.metrics[SCORE]):
         values = ', '.join(f'{name} {value:.3g}' for name, value in result.config.items())
         print(f'{result.metrics[SCORE]:.3f} after {result.metrics["samples"]:8}: {values}')
 

@@ -263,7 +263,7 @@ class LearnTest(FolderTest):
         ({'also': ('FSM_Hopper2D_*',)}, '4 simulations for 10 environments'),
         ({'gaits': ('tuned',)}, "'tuned'.*did you mean"),
         ({'gaits': ('big_hop',)}, "'big_hop'.*within the action range"),
-        ({'start': HOPPER}, 'has 211 inputs, that of .* 144; .* setting view'),
+        ({'start': HOPPER}, 'has 211 inputs, that of .* 144 inputs; .* setting view'),
     )
     def test_bad_settings_are_refused(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -673,10 +674,13 @@ class TrimTest(FolderTest):
 class ProgramsTest(FolderTest):
     def test_every_program_ends_errors_in_one_line(self):
         folder = pathlib.Path(ppo.__file__).parent
-        for path in (*folder.glob('*.py'), *folder.with_name('examples').glob('*.py')):
+        others = (
+            folder.with_name(name).glob('*.py') for name in ('examples', 'docs', 'benchmarks')
+        )
+        for path in (*folder.glob('*.py'), *itertools.chain(*others)):
             text = path.read_text()
             if '__main__' in text or ('.parse_args(' in text and path.parent != folder):
-                self.assertRegex(text, r'(?m)^(    )?begin_script\(\)$', path.name)
+                self.assertRegex(text, r'(?m)^(    )?(program\.)?begin_script\(\)$', path.name)
 
     @parameterized.parameters(
         (train_all, '--jobs 0', '--jobs is 0; expected a whole number at least 1'),

@@ -106,10 +106,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         """
         errors.check_known('option of reset', ('level',), *(options or {}))
         level = (options or {}).get('level')
-        stream: Any = seed
+        stream = arguments.stream_seed(seed)
         if seed is not None:
-            if arguments.is_integer(seed) and seed >= 2**32:
-                (stream,) = np.random.SeedSequence(seed).generate_state(1).tolist()
             arguments.check_seed('seed', stream)
             seed = int(seed)
         if level is not None:
@@ -209,12 +207,18 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(
                 f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
             )
-        if isinstance(seed, (list, tuple)) and None in seed:
-            seeds = arguments.all_seeds([each or 0 for each in seed], self.num_envs).tolist()
-            self.environment.seed(seeds, env_ids & np.array([each is not None for each in seed]))
-            seed = None
-        known: Any = seed
-        observation = self.environment.reset(env_ids, known, (options or {}).get('level'))
+        seeds: Any = seed
+        level = (options or {}).get('level')
+        if isinstance(seed, (list, tuple)):
+            seeds = [*map(arguments.stream_seed, seed)]
+            if None in seeds:
+                known = np.array([each is not None for each in seeds])
+                seeds = arguments.all_seeds([each or 0 for each in seeds], self.num_envs).tolist()
+                if level is not None:  # raises before anything changes
+                    self.environment.task.choose_level(np.flatnonzero(env_ids), level)
+                self.environment.seed(seeds, env_ids & known)
+                seeds = level = None
+        observation = self.environment.reset(env_ids, seeds, level)
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         return observation, masked(flat(self.environment.info), env_ids)
 

@@ -21,6 +21,7 @@ from trl_suite.adapters.gym import SuiteVectorEnv, flat
 from trl_suite.environments import arguments
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.util import errors
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -64,6 +65,10 @@ class SuiteVecEnv(VecEnv):
             environment = VectorEnvironment(
                 environment, num_envs, num_threads, seed, **usual | options
             )
+        elif options or seed is not None or num_envs not in (1, environment.num_envs):
+            raise ValueError(
+                'num_envs, seed and options cannot change an environment that is already made'
+            )
         if environment.autoreset != 'same_step':
             raise ValueError(f"autoreset is {environment.autoreset!r}; expected 'same_step'")
         self.environment = environment
@@ -86,9 +91,11 @@ class SuiteVecEnv(VecEnv):
     def reset(self) -> Any:
         """Starts an episode in every simulation; `set_options` may have set its 'level'."""
         seeds = [seed for seed in self._seeds if seed is not None] or None
-        for env_id, options in enumerate(self._options):
-            if (level := options.get('level')) is not None:
-                self.environment.task.choose_level([env_id], level)
+        for options in self._options:
+            errors.check_known('option of reset', ('level',), *options)
+        levels = {i: each['level'] for i, each in enumerate(self._options) if 'level' in each}
+        if levels:
+            self.environment.task.choose_level([*levels], [*levels.values()])
         self._reset_seeds()
         self._reset_options()
         observation = self.environment.reset(seed=seeds)

@@ -56,7 +56,12 @@ class Joint:
     def __post_init__(self) -> None:
         for name in ('kp', 'kd', 'weight', 'armature'):
             checked(f'{name} of a joint', getattr(self, name), float, at_least=0)
-        checked('original_range of a joint', self.original_range, Range | None)
+        if self.original_range is not None:
+            checked('original_range of a joint', self.original_range, Range)
+            if not np.ndim(self.original_range):
+                raise ValueError(
+                    f'original_range of a joint is {self.original_range}; expected two limits'
+                )
         if np.shape(errors.floats('target of a joint', self.target)) not in ((), (3,)):
             raise ValueError(
                 f'target of a joint is {self.target!r}; expected a number, or a rotation vector'
@@ -166,9 +171,15 @@ class Character(composer.Entity):
                     f'character {spec.name!r}: target of {joint!r} is {given.target}; expected a number, as '
                     'it is no ball joint'
                 )
-            if np.ndim(given.target) == 0 and not low - 1e-6 <= given.target <= high + 1e-6:
+            if ball and not np.ndim(given.target) and given.target:
                 raise ValueError(
-                    f'character {spec.name!r}: target of {joint!r} is {given.target:g}; expected {low:g} to '
+                    f'character {spec.name!r}: target of {joint!r} is {given.target}; expected a rotation '
+                    'vector, or 0, as it is a ball joint'
+                )
+            target = np.linalg.norm(given.target) if np.ndim(given.target) else given.target
+            if not low - 1e-6 <= target <= high + 1e-6:
+                raise ValueError(
+                    f'character {spec.name!r}: target of {joint!r} is {target:g}; expected {low:g} to '
                     f'{high:g}, its limits'
                 )
 

@@ -123,6 +123,9 @@ def from_file(
         checked('fall_links', fall_links, Names),
         checked('stumble_exempt', stumble_exempt, Names),
     ]
+    for given in names:
+        if len(set(given or ())) < len(given or ()):
+            raise ValueError(f'{", ".join(given or ())}: expected names without repeats')
     if names[0] == ():
         raise ValueError(f'end_effectors is {end_effectors!r}; expected one name or more')
     if name == '':

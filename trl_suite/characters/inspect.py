@@ -287,9 +287,9 @@ class ModelInspector:
         )
         for a in np.flatnonzero(at):
             gear, bias = abs(model.actuator_gear[a, 0]), model.actuator_biasprm[a]
-            if model.actuator_forcelimited[a]:
+            if model.actuator_forcelimited[a]:  # before the gear
                 limits.append(gear * np.abs(model.actuator_forcerange[a]).max())
-            elif model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
+            if model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
                 if model.actuator_ctrllimited[a]:
                     full = np.abs(model.actuator_ctrlrange[a]).max()
                     limits.append(gear * full * abs(model.actuator_gainprm[a, 0]))
@@ -324,6 +324,10 @@ class ModelInspector:
         if kind == _BALL:
             vector = np.zeros(3)
             mujoco.mju_quat2Vel(vector, pose[address : address + 4], 1.0)
+            angle, most = np.linalg.norm(vector), model.jnt_range[i, 1]
+            if model.jnt_limited[i] and angle > most:
+                vector *= most / angle
+                moved.append(f'{model.joint(i).name} {most:.3g}')
             return tuple(vector.tolist()) if vector.any() else 0.0
         target = float(pose[address])
         if model.jnt_limited[i]:

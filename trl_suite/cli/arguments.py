@@ -58,6 +58,15 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
+def options_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Returns the options of the task by name.
+
+    Raises:
+      ValueError: one is given twice.
+    """
+    return files.without_repetition(arguments.options or [])
+
+
 def add_threads(command: argparse.ArgumentParser) -> None:
     """Adds the number of threads."""
     text = 'threads of the physics; 0: all cores'

@@ -63,7 +63,7 @@ def rate(step: Callable[[], object], seconds: float, per_call: int = 1) -> float
     """Calls `step` for about `seconds`; returns items per second."""
     step()
     calls, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
+    while not calls or time.perf_counter() - begin < seconds:
         step()
         calls += 1
     return calls * per_call / (time.perf_counter() - begin)

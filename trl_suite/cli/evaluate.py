@@ -14,6 +14,7 @@ from trl_suite.cli.arguments import (
     add_options,
     add_policy,
     add_threads,
+    options_of,
     positive,
 )
 from trl_suite.environments import named_policies as acting
@@ -43,8 +44,10 @@ def run(arguments: argparse.Namespace) -> None:
     from trl_suite import evaluation
 
     baseline = acting.BASELINES.get(arguments.policy)
-    options = dict(arguments.options or ())
+    options = options_of(arguments)
     if arguments.step_limit is not None:
+        if 'step_limit' in options:
+            raise ValueError('step_limit is given twice: by --option and by --step-limit')
         options['step_limit'] = arguments.step_limit
     policy = baseline or acting.trained(arguments.policy, spec.id)
     settings = arguments.episodes, arguments.seed, arguments.threads, options
@@ -53,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
     result['policy'] = arguments.policy
     if arguments.json is not None:
-        given = {'options': dict(arguments.options)} if arguments.options else {}
+        given = {'options': options_of(arguments)} if arguments.options else {}
         files.write_json({**result, **given}, arguments.json)
     returns, distances = result['return_interval'], result['distance_interval']
     around = '' if returns is None else f' +- {returns:.2f} (95 % confidence)'

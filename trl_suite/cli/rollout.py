@@ -17,6 +17,7 @@ from trl_suite.cli.arguments import (
     add_id,
     add_options,
     add_policy,
+    options_of,
     positive,
     valid,
 )
@@ -66,7 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from trl_suite.evaluation import PROGRESS_DELAY
 
-    options = dict(arguments.options or ())
+    options = options_of(arguments)
     environment = suite.make(arguments.id, {**options, 'random': arguments.seed})
     policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
     width, height = arguments.size

@@ -213,6 +213,12 @@ def _comparable(benchmark: Any, result: dict[str, Any]) -> str:
 def _report(arguments: argparse.Namespace) -> None:
     report = engine.load('trl_suite.benchmark.report')
     benchmark = engine.load('trl_suite.benchmark')
+    if arguments.json is not None:
+        for entry in filter(pathlib.Path.is_dir, arguments.entries):
+            if arguments.json.resolve().is_relative_to(entry.resolve()):
+                raise ValueError(
+                    f'--json is {arguments.json}, in a folder of results; expected another folder'
+                )
     results = [result for _, result in _read(benchmark, arguments.entries)]
     found = report.report(results)
     print('\n'.join(map(program.printable, report.table(found).split('\n'))))

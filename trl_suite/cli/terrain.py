@@ -12,6 +12,7 @@ from trl_suite import rendering, terrain
 from trl_suite.cli.arguments import add_command, add_file, positive
 from trl_suite.terrain.mesh import LARGEST_SIDE
 from trl_suite.util import files
+from trl_suite.util.options import checked
 
 BEFORE = 2.0  # m; extent of planar ground behind the start
 LONGEST = LARGEST_SIDE - BEFORE  # m
@@ -59,6 +60,7 @@ def _write_mesh(
     length = arguments.length
     if not 0 < length <= LONGEST:
         raise ValueError(f'length is {length}; expected metres in (0, {LONGEST:g}]')
+    checked('seed', arguments.seed, int, at_least=0)
     draw = terrain.SpatialGround if source.spatial else terrain.PlanarGround
     # The same ground as in the first plot.
     ground = draw(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from trl_suite import rendering
 from trl_suite.cli import engine
-from trl_suite.cli.arguments import add_command, add_id, add_options, positive, valid
+from trl_suite.cli.arguments import add_command, add_id, add_options, options_of, positive, valid
 from trl_suite.environments import named_policies as acting
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _policy(text: str) -> str:
 
 def run(arguments: argparse.Namespace) -> None:
     """Opens a window and returns when it is closed, or serves web browsers until interrupted."""
-    options = dict(arguments.options or ())
+    options = options_of(arguments)
     if arguments.browser:
         in_browser(arguments, options)
         return

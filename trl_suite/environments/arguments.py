@@ -50,7 +50,10 @@ def given_ids(env_ids: Ids, num_envs: int) -> list[int]:
       TypeError: they are neither integers nor a mask.
       ValueError: there are no such simulations, or a mask has another shape.
     """
-    ids = np.atleast_1d(np.arange(num_envs) if env_ids is None else np.asarray(env_ids))
+    try:
+        ids = np.atleast_1d(np.arange(num_envs) if env_ids is None else np.asarray(env_ids))
+    except ValueError:  # lists of different lengths
+        ids = np.atleast_2d(np.nan)
     if ids.dtype == bool:
         if ids.shape != (num_envs,):
             raise ValueError(f'mask has shape {ids.shape}; expected ({num_envs},)')
@@ -77,6 +80,13 @@ def is_integer(seed: Any) -> TypeGuard[int]:
     return isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
 
 
+def stream_seed(seed: Any) -> Any:
+    """Returns the seed of one random stream: that of a whole number of 2**32 or more is hashed."""
+    if is_integer(seed) and seed >= 2**32:
+        return int(np.random.SeedSequence(seed).generate_state(1)[0])
+    return seed
+
+
 def check_seed(name: str, seed: Any) -> None:
     """Checks the seed of one random stream: raises a TypeError or ValueError."""
     if not is_integer(seed):
@@ -94,7 +104,7 @@ def all_seeds(seed: int | Sequence[int] | None, num_envs: int) -> np.ndarray:
       num_envs: number of simulations, n.
 
     Raises:
-      TypeError: a seed that is not an integer.
+      TypeError: a seed that is no integer, nor a sequence.
       ValueError: a negative seed, a wrong number of seeds, or one that is no integer in [0, 2**32).
     """
     if seed is None or is_integer(seed):
@@ -107,6 +117,8 @@ def all_seeds(seed: int | Sequence[int] | None, num_envs: int) -> np.ndarray:
         seeds = np.asarray(seed)
     except ValueError:  # lists of different lengths
         seeds = np.asarray(None)
+    if seeds.dtype.kind in 'iu' and seeds.ndim > 1:
+        raise ValueError(f'seed has shape {seeds.shape}; expected ({num_envs},)')
     if seeds.dtype.kind in 'iu' and seeds.shape != (num_envs,):
         raise ValueError(f'seed has {seeds.size} seeds for {num_envs} simulations')
     if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():

@@ -137,8 +137,8 @@ class Environment(composer.Environment):
             self._show_reward(0.0)
             # Composer's hooks: that of the task, `Task.initialize_episode`, and those of entities.
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-            if self._begun_by_hooks:  # which may have changed the state of the physics
-                core.world.forward(core.world.all_ids)
+            if self._begun_by_hooks:
+                core.task.after_hooks()
             core.restart(0)
             if self._has_own_observables:
                 self._observation_updater.reset(self._physics_proxy, self._random_state)

@@ -130,12 +130,13 @@ class VectorEnvironment:
             raise ValueError(
                 f'the task or an entity in it has a hook {names[0]}, which only a single Environment calls'
             )
-        for entity in task.root_entity.iter_entities():
-            for name, each in entity.observables.as_dict().items():
-                if each.enabled:
+        entities = (each.observables.as_dict() for each in task.root_entity.iter_entities())
+        for own in (*entities, vars(task).get('_task_observables', {})):
+            for name, each in own.items():
+                if each.enabled and name not in task.blocks:
                     raise ValueError(
-                        f"observable {name!r} is an entity's, which only a single Environment has; expected "
-                        "the option 'observations'"
+                        f'observable {name!r} is one that only a single Environment has; expected the option '
+                        "'observations'"
                     )
         model = light_model(task.root_entity.mjcf_model)
         task.attach(BatchWorld(model, self.num_envs, int(num_threads), task.fields))
@@ -311,9 +312,7 @@ class VectorEnvironment:
           RuntimeError: only some simulations are restored before the first reset.
         """
         self.core.set_state(state, env_ids)
-        ids = arguments.given_ids(env_ids, self.num_envs)
-        self.at_limit = self.at_limit.copy()
-        self.at_limit[ids] = self.core.at_limit(ids, self.step_limit, self.time_limit)
+        self._find_limits(arguments.given_ids(env_ids, self.num_envs))
 
     def copy_from(
         self, other: VectorEnvironment, other_ids: Sequence[int], env_ids: Sequence[int]
@@ -351,6 +350,12 @@ class VectorEnvironment:
                     'different ones'
                 )
             core.write(others.read(sources), ids)
+            self._find_limits(ids)
+
+    def _find_limits(self, ids: list[int]) -> None:
+        """Updates `at_limit` of some simulations, whose state has been replaced."""
+        self.at_limit = self.at_limit.copy()
+        self.at_limit[ids] = self.core.at_limit(ids, self.step_limit, self.time_limit)
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(

@@ -115,7 +115,7 @@ class Format:
             and what was expected.
           OSError: the file cannot be read.
         """
-        result = files.read_json(files.existing(path, ('.json',)), files.without_repetition)
+        result = files.read_json(files.existing(path, ('.json',)))
         with errors.naming(path):
             self.check(result, complete)
         return result
@@ -175,7 +175,8 @@ def _check_rows(result: dict[str, Any], course: Course, complete: bool) -> None:
     """Checks numbers and shapes of everything that was measured."""
     tasks, stages = len(course), len(course.stages)
     _check_numbers('initial', result['initial'], tasks, at_most=1)
-    stages = stages if complete else min(len(result['scores']), stages)
+    if not complete and isinstance(result['scores'], list):
+        stages = min(len(result['scores']), stages)
     for name in ROWS:
         if not isinstance(result[name], list) or len(result[name]) != stages:
             found = len(result[name]) if isinstance(result[name], list) else result[name]

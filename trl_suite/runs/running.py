@@ -118,7 +118,12 @@ class Benchmark(results.Format):
                 'another name'
             )
         if course.name not in self.courses:
-            self.custom(course.name, course.ids)
+            found = self.custom(course.name, course.ids)
+            for name in ('parts', 'step_limit'):  # which results do not hold
+                if getattr(course, name) != (expected := getattr(found, name)):
+                    raise ValueError(
+                        f'{course.name!r} has {name}={getattr(course, name)}; expected {expected}'
+                    )
         course.check_alike()
         count = len(course.stages)
         stages = checked(
@@ -128,6 +133,11 @@ class Benchmark(results.Format):
         if isinstance(learner, type) or not isinstance(learner, Learner):
             raise TypeError(
                 f'learner is {learner!r}; expected an object with methods train and policy'
+            )
+        if stages < count and not isinstance(learner, Resumable):
+            raise ValueError(
+                f'stages is {stages}; expected {count}, since a {kind.__name__} cannot resume: it has no '
+                'methods save and load'
             )
         path = files.check_path(path, ('.json',))
         result: dict[str, Any] = {
@@ -263,7 +273,8 @@ class Benchmark(results.Format):
     ) -> dict[str, Any]:
         """Returns the result so far, and restores the learner if the run has not ended."""
         result = self.read(path, complete=False)
-        for name in (*self.settings, 'mujoco'):
+        unfinished = len(result['scores']) < stages
+        for name in (*self.settings, 'mujoco', *(['trl_suite'] if unfinished else ())):
             if result.get(name, expected[name]) != expected[name]:
                 raise ValueError(
                     f'{path} holds another run: {name} is {result[name]}; expected {expected[name]}'

@@ -107,6 +107,7 @@ class Task(composer.Task):
     step_in_parts = True  # the same, without components
     levels: Levels | None = None  # the component that chooses terrain, if there is one
     _just_reset = False  # whether composer has reset the task, and no step has followed yet
+    _begun: tuple[np.ndarray, np.ndarray]  # qpos and qvel after composer has reset the task
 
     # Methods that a subclass implements.
 
@@ -353,6 +354,18 @@ class Task(composer.Task):
     ) -> None:
         self.begin(self.world.all_ids, [random_state])
         self._just_reset = True
+        self._begun = self.world.qpos.copy(), self.world.qvel.copy()
+
+    def after_hooks(self) -> None:
+        """Measures again if composer's hooks have changed the pose or the rates since `initialize_episode`."""
+        world, ids = self.world, self.world.all_ids
+        if all(map(np.array_equal, self._begun, (world.qpos, world.qvel))):
+            return
+        world.forward(ids)
+        self.observe(ids)
+        self.outcome.reward_terms[ids] = 0.0  # `observe` may have written those of the start
+        for component in self.components:
+            component.finish(ids, True)
 
     def before_step(
         self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState

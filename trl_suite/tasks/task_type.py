@@ -17,6 +17,7 @@ from trl_suite.tasks.navigation import direct
 from trl_suite.tasks.navigation.hierarchical import HierarchicalConfig, HierarchicalNavigation
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.walk import task as walk
+from trl_suite.util import errors
 from trl_suite.util.options import Config
 
 
@@ -78,7 +79,11 @@ def tracking(task: Callable[..., Task], with_ball: bool = False) -> Callable[[Pa
 
 def _direct(parts: Parts, config: Any) -> Task:
     if config.reward == 'original':
-        steps = motion.load_steps(parts.character.spec.name)
+        name = parts.character.spec.name
+        errors.check_known(
+            "character with reward='original', which needs its steps", motion.steps_names(), name
+        )
+        steps = motion.load_steps(name)
         return direct.hidden_plan(parts.character, parts.arena, steps, config, parts.actuation)
     return tracking(direct.DirectNavigation)(parts, config)
 

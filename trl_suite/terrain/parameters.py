@@ -48,7 +48,7 @@ import trl_suite.terrain.spatial.features  # noqa: F401
 from trl_suite.terrain.generators import GENERATORS, GENERATORS3D, Generator, check
 from trl_suite.terrain.spatial.layout import GRID
 from trl_suite.util.errors import check_known, is_number, unknown
-from trl_suite.util.files import existing, read_json, without_repetition
+from trl_suite.util.files import existing, read_json
 from trl_suite.util.options import checked
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
@@ -212,7 +212,7 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
             )
         check_known('terrain', known, name)
         return known[name]
-    content = read_json(existing(name), without_repetition)
+    content = read_json(existing(name))
     if not isinstance(content, dict):
         raise ValueError(f'{name}: must hold a JSON object with keys Type and Params')
     return _from_mapping(name, content)

@@ -11,7 +11,7 @@ import pathlib
 import re
 import secrets
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, TextIO
 
 from trl_suite.util import errors
@@ -142,13 +142,11 @@ def without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def read_json(
-    path: Path, object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None
-) -> Any:
-    """Returns the content of a JSON file; errors of the hook, see `json.loads`, name the file."""
+def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file, whose objects may not repeat keys."""
     text = read_text(path)
     try:
-        return json.loads(text, object_pairs_hook=object_pairs_hook)
+        return json.loads(text, object_pairs_hook=without_repetition)
     except RecursionError:
         raise ValueError(f'{path}: not JSON: nested too deeply') from None
     except ValueError as error:  # also raised for integers with too many digits

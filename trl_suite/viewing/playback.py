@@ -46,10 +46,16 @@ class Playback(dm_env.Environment):
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         environment = self._environment
         if not self._left:
-            with rendering.calling_each_frame(
-                environment, lambda: self._left.append(environment.get_state())
-            ):
+            times, data = [environment.physics.data.time], environment.physics.data
+
+            def keep() -> None:
+                times.append(data.time)
+                self._left.append(environment.get_state())
+
+            with rendering.calling_each_frame(environment, keep):
                 self._end = environment.step(action)
+            if self._left and times[-1] == data.time:
+                self._left.pop()  # the last frame, which lacks the results of the step
             self._left.append(environment.get_state())
         environment.set_state(self._left.popleft())
         if self._left:

@@ -116,8 +116,11 @@ class SpatialFootstepsConfig(MirroredConfig):
             replaced = {'force': None} if 'speed' in self.pushes else {}
             self._set('pushes', {**PUSHES, **replaced, **self.pushes})
         super().__post_init__()
-        if self.hidden_plan and self.mirrored:
-            raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
+        for name in ('mirrored', 'goal'):  # with a hidden plan there is always a goal
+            if self.hidden_plan and getattr(self, name):
+                raise ValueError(
+                    f'hidden_plan and {name} cannot be combined; pass only one of them'
+                )
 
 
 class Footsteps(PlanTask):
@@ -209,7 +212,8 @@ class SpatialFootsteps(Footsteps):
             self._first = straight_step(self.steps, self.length)
         pushes = self.config.pushes
         if pushes is not None:
-            body = pushes.body or character.spec.links[1]  # the torso
+            links = character.spec.links
+            body = pushes.body or ('torso' if 'torso' in links else links[0])
             self.add(Pushes(dataclasses.replace(pushes, body=body)))
 
     def _further_blocks(self, character: Character, config: Any) -> tuple[Block, ...]:
