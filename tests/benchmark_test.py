@@ -307,6 +307,18 @@ class ReportCommandTest(CommandTest):
         del unfinished['metrics']
         unfinished['digest'] = results.digest(unfinished)
         pathlib.Path('empty/b.json').write_text(json.dumps(unfinished))
+        nothing = {**unfinished, 'scores': None}
+        pathlib.Path('nothing.json').write_text(json.dumps(nothing))
+        with self.assertRaisesRegex(ValueError, 'scores: None stages; expected 20'):
+            benchmark.BENCHMARK.read('nothing.json', complete=False)
+        self.assert_refused(
+            'in a folder of results',
+            'benchmark',
+            'report',
+            'Nothing',
+            '--json',
+            'Nothing/report.json',
+        )
         for action in 'check', 'report', 'verify':
             status, _, told = run('benchmark', action, 'empty')
             self.assertEqual(status, 2)

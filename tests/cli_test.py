@@ -467,6 +467,15 @@ class EvaluateTest(CommandTest):
         ("'0' is not a positive integer", GAPS, '--episodes', '0'),
         ('seed is -1; expected a whole', GAPS, '--policy', 'zero', '--seed', '-1'),
         ('num_threads is -1', GAPS, '--policy', 'zero', '--threads', '-1'),
+        ('step_limit is given twice', GAPS, '--option', 'step_limit=3', '--step-limit', '2'),
+        (
+            "'levels'.* twice|'levels'.*repeat|repeat.*levels",
+            GAPS,
+            '--option',
+            'levels=[0,3]',
+            '--option',
+            'levels=[0,4]',
+        ),
         ("the folder 'no' does not exist", GAPS, '--json', 'no/a.json'),
     )
     def test_errors_leave_no_files(self, message, *arguments):
@@ -550,6 +559,7 @@ class TerrainTest(CommandTest):
         ('FaceLength is -1', 'gaps', '--face-length', '-1'),
         ("unknown suffix '.pdf'; expected .*png or .obj", 'gaps', '--output', 'a.pdf'),
         ('length is 4000', 'hills3d', '--length', '4000', '--output', 'a.obj'),
+        ('seed is -2', 'gaps', '--seed', '-2', '--output', 'a.obj'),
     )
     def test_errors_leave_no_files(self, message, *arguments):
         pathlib.Path('bad.json').write_text('{"Type": "var2d_gap"}')

@@ -755,6 +755,8 @@ REFUSED = (
         ({'reference_observation': True}, "unknown option.*'reference_observation'"),
     )),
     (PLANAR, {'plans': {'width': (0.1, 0.2)}}, "unknown option of plans 'width'"),
+    *((GENERAL, {'hidden_plan': True, name: True}, f'hidden_plan and {name} cannot be combined')
+      for name in ('mirrored', 'goal')),
     *((GENERAL, {'plans': {name: value}}, message) for name, value, message in (
         ('width', (-0.1, 0.2), 'width is'), ('width', (0.1, np.inf), 'width is'), ('sharp', -0.1, 'sharp is -0.1'),
         ('stay', (1, 1e30), r'stay is \(1, 1e\+30\); expected .* from 1 to 10000, in footsteps'),

@@ -289,7 +289,7 @@ class VectorTest(Same, parameterized.TestCase):
                 # Gymnasium's takes the mask out of the dict.
                 options = [{'reset_mask': ended.copy()} for _ in range(2)]
                 # Of the simulations that are reset.
-                seed = [100 + step, None, step] if step % 2 else None
+                seed = [100 + step, None, 2**32 + step] if step % 2 else None
                 self.assert_same(
                     ours.reset(seed=seed, options=options[0]),
                     theirs.reset(seed=seed, options=options[1]),

@@ -305,6 +305,18 @@ class CharacterTest(WrittenTest):
             (lambda: read('value="2"', 'value="0"'), f'{link}it moves, and has no mass or no inertia; expected both'),
         )  # fmt: skip
 
+    @parameterized.parameters(
+        ('ctrlrange="-1 1"', 50), ('ctrlrange="-1 1" forcerange="-100 100"', 50),
+        ('ctrlrange="-9 9" forcerange="-2 2"', 100), ('forcerange="-2 2"', 100),
+    )  # fmt: skip
+    def test_torque_limits_of_a_motor(self, ranges, limit):
+        """The smaller of both ranges, times the gear, 50."""
+        spec = self.planar(MJCF.replace('ctrlrange="-1 1"', ranges))
+        model = characters.make(spec)
+        self.assertEqual(
+            dict(zip(spec.joints, model.torque_limits, strict=True))['right_knee'], limit
+        )
+
     @parameterized.parameters(('ixx=".01"', 'ixx=".1"', 0.04), ('ixy="0"', 'ixy=".01"', 0.01))
     def test_inertia_is_balanced_on_request(self, before, after, expected):
         spec = model_file.named(self.write(URDF.replace(before, after), 'two.urdf'))
@@ -355,6 +367,7 @@ class CharacterTest(WrittenTest):
             ({'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
             ({'end_effectors': ()}, 'expected one name or more'),
             ({'fall_links': 'trunk'}, 'expected a list of strings or None'),
+            ({'fall_links': ('trunk', 'trunk')}, 'trunk, trunk: expected names without repeats'),
             ({'balance_inertia': 1}, 'balance_inertia is 1; expected True or False'),
             ({'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
             ({'name': 'dog'}, "has a character named 'dog'"),

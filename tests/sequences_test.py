@@ -486,7 +486,12 @@ class RunTest(RunCase):
             (run(Keeper()), 'another run: learner is .*Counter; expected .*Keeper'),
             (run(Counter(), budget=0), 'budget is 0'),
             (run(Counter(), stages=4), 'stages is 4; expected a whole number from 1 to 3'),
+            (run(Counter(), stages=2), 'stages is 2; expected 3, since a Counter cannot resume'),
             (run(Counter(), path=self.folder / 'result.txt'), "'.txt'"),
+            (
+                lambda: sequences.run(sequences.Sequence('mine', SHORT.ids, parts=2), Counter()),
+                "'mine' has parts=2; expected 1",
+            ),
             (
                 lambda: sequences.run(sequences.Sequence('plaid_dog', SHORT.ids), Counter()),
                 "'plaid_dog' is a sequence of the benchmark with other contents",

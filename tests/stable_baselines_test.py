@@ -96,6 +96,12 @@ class StableBaselinesTest(parameterized.TestCase):
         self.assertEqual(envs.environment.level[[0, 2]].tolist(), [7, 9])
         envs.reset()
         self.assertNotEqual(envs.environment.level[[0, 2]].tolist(), [7, 9])
+        envs.set_options({'levle': 3})
+        with self.assertRaisesRegex(ValueError, "unknown option of reset 'levle'; did you mean"):
+            envs.reset()
+        for given in ({'seed': 1}, {'num_envs': 2}, {'step_limit': 3}):
+            with self.assertRaisesRegex(ValueError, 'already made'):
+                SuiteVecEnv(envs.environment, **given)
 
     def test_render(self):
         envs = SuiteVecEnv(FLAT, 3, 1, seed=0, render_mode='rgb_array', render_kwargs=SMALL)
