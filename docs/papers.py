@@ -169,12 +169,21 @@ def plans() -> str:
 
 
 def foresight() -> str:
+    found = gallery.record('foresight')
     rows = [
-        (f'`{id}`', f'{gallery.evaluation(id)["distance"]:.1f}',
-         *(', '.join(f'{metres:.1f}' for metres in found[kind]['metres']) for kind in ('base', 'noisy')))
-        for id, found in gallery.record('foresight').items()
+        (f'`{id}`', *(
+            f'{np.mean(metres):.1f} ({min(metres):.1f} to {max(metres):.1f})'
+            for metres in (each['policy'], each['base']['metres'], each['noisy']['metres'])
+        ))
+        for id, each in found.items()
     ]  # fmt: skip
-    return table(('environment', 'policy, m', 'base actions, m', 'all parameters, m'), rows)
+    one = next(iter(found.values()))
+    text = (
+        f'Each search ends at {one["asked"]:g} m or after {one["budget"]:,} cycles; mean of {len(one["policy"])} '
+        'terrains, and their range:'
+    )
+    head = 'environment', 'policy, m', 'base actions, m', 'all parameters, m'
+    return f'{text}\n\n{table(head, rows)}'
 
 
 def controllers(names: str) -> str:

@@ -118,7 +118,9 @@ class RayExecutor:
             self._call.remote(expected, function, *arguments)
             for arguments in zip(*iterables, strict=False)
         ]
-        return _results(tasks)
+        results = _results(tasks)
+        next(results)  # only a generator that has begun cancels what is left at its end
+        return results
 
     def close(self) -> None:
         """Disconnects; ends a Ray that this object has started."""
@@ -133,8 +135,9 @@ class RayExecutor:
 
 
 def _results(tasks: list[Any]) -> Iterator[Any]:
-    """Yields results; cancels the tasks that are left if the caller stops or a task fails."""
+    """Yields None, then results; cancels the tasks that are left if the caller stops or a task fails."""
     try:
+        yield None
         while tasks:
             yield ray.get(tasks[0])
             del tasks[0]

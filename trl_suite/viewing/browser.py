@@ -284,6 +284,7 @@ class Browser:
             except Exception as error:  # whatever is asked, the viewer goes on
                 self._panel.tell(program.in_one_line(error))
                 self._panel.show(self._loaded, self.session)  # what was chosen is not shown
+                self._panel.report(self.session.status(), self.playing)
 
     def _loading(self, text: str) -> None:
         self._panel.report({'loading': text}, self.playing)
@@ -315,7 +316,10 @@ class Browser:
         acting = self._acting(loaded)
         self._loaded = loaded
         self.session = Session(loaded.environment, acting, self.seed)
+        before = getattr(self, '_scene', None)
         self._scene = web_scene.WebScene(self._server, loaded.environment)
+        if before is not None:
+            self._scene.follow = before.follow
         self._panel.show(loaded, self.session)
         self._redraw()
 

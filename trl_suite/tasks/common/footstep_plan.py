@@ -137,13 +137,18 @@ def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Mark
 
 
 def check_two_feet(spec: CharacterSpec) -> None:
-    """Checks that a character has two feet.
+    """Checks that a character has two feet, the right one first.
 
     Raises:
-      ValueError: the character does not have two end effectors.
+      ValueError: the character does not have two end effectors, or they are a left and a right link.
     """
     if len(spec.end_effectors) != 2:
         raise ValueError(f'character {spec.name!r} does not have two end effectors as feet')
+    if spec.end_effectors[::-1] in spec.mirror:
+        raise ValueError(
+            f'character {spec.name!r} has {", ".join(spec.end_effectors)} as end effectors; expected the right '
+            'foot first'
+        )
 
 
 # The single step from which episodes start.

@@ -350,7 +350,13 @@ def styled(steps: FootstepLibrary, style: str) -> FootstepLibrary:
     named = {name for name in steps_names() if name.startswith(prefix)}
     known = {name.removeprefix(prefix) for name in named - {*CHARACTERS}}
     check_known(f'style of {steps.name!r}', known, style)
-    return load_steps(prefix + style)
+    found = load_steps(prefix + style)
+    if not np.isclose(found.duration, steps.duration):
+        raise ValueError(
+            f'style {style!r} has steps of {found.duration:g} s; expected {steps.duration:g} s, as those of '
+            f'{steps.name!r}'
+        )
+    return found
 
 
 def check_feet(character: CharacterSpec) -> None:
