@@ -5,6 +5,7 @@ import re
 import tempfile
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
 TORCH = 'torch>=2.5'
 # Below the next version that may change what the suite calls: of viser this is not only its interface
@@ -27,12 +28,21 @@ def long_description() -> str:
     return re.sub(r'\[([^]]*)\]\((?!https?:)[^)]*\)', r'\1', text)
 
 
+class DataOnly(build_py):
+    """Leaves out modules of packages that are folders of data, such as `trained/setup.py`."""
+
+    def find_package_modules(self, package, package_dir):
+        found = super().find_package_modules(package, package_dir)
+        return found if package_dir.startswith('trl_suite') else []
+
+
 # A new folder: setuptools packs what an earlier build left in build/, deleted modules included.
 build = tempfile.TemporaryDirectory()
 
 setup(
     name='trl_suite',
     options={'build': {'build_base': build.name}},
+    cmdclass={'build_py': DataOnly},
     version=VERSION,
     description='Terrain RL Simulator on MuJoCo: locomotion over random terrain, as a suite',
     long_description=long_description(),
@@ -106,7 +116,7 @@ setup(
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
         'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],
         'cluster': [f'ray{RAY}', 'fsspec'],
-        'shimmy': ['shimmy[dm-control]>=2.0,<3'],
+        'shimmy': ["shimmy[dm-control]>=2.0,<3; python_version < '3.13'"],  # it requires labmaze
         'clips': [BVH],
         'train': [TORCH],
         'tune': ['cma'],
@@ -142,6 +152,8 @@ setup(
             'sphinx-argparse-cli>=1.20,<2',
             'sphinx-copybutton>=0.5,<1',
             'gymnasium>=1.1',
+            'imageio[ffmpeg]',
+            'matplotlib',
             VISER,
         ],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'import-linter==2.16', 'twine>=6'],

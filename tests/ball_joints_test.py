@@ -5,9 +5,9 @@ import dataclasses
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
-from characters_test import SPATIAL, users_arena
+from characters_test import SPATIAL
 from dm_control import mjcf
-from helpers import assert_refused
+from helpers import assert_refused, users_arena
 
 from trl_suite import actuation, characters
 from trl_suite.motion import quaternion

@@ -13,8 +13,8 @@ import sys
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
-from dm_control import composer, mjcf
-from helpers import assert_refused
+from dm_control import mjcf
+from helpers import assert_refused, users_arena
 
 from trl_suite import actuation, characters
 
@@ -30,13 +30,6 @@ def alone(name):
     model, data = physics.model.ptr, physics.data.ptr
     mujoco.mj_forward(model, data)
     return model, data
-
-
-def users_arena(timestep=0.002):
-    arena = composer.Arena(name='mine')
-    arena.mjcf_model.option.timestep = timestep
-    arena.mjcf_model.worldbody.add('geom', name='floor', type='plane', size=(0, 0, 1))
-    return arena
 
 
 def lowest(model, data):

@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 from absl.testing import parameterized
 from dm_control import mjcf
-from dm_control.locomotion.arenas import floors
-from helpers import assert_refused
+from helpers import assert_refused, users_arena
 
 from trl_suite import actuation, characters, controllers, suite
 from trl_suite.controllers import dynamics, gaits, parameters
@@ -122,7 +121,7 @@ class ParametersTest(parameterized.TestCase):
             ('same number of joints', {'legs': [['hip'], ['hip', 'leg']], 'feet': ['leg', 'leg']}),
             ('one foot for each', {'feet': []}),
         )
-        arena, biped = floors.Floor(), characters.make('biped2d')
+        arena, biped = users_arena(), characters.make('biped2d')
         arena.attach(biped)
         assert_refused(
             self,
@@ -587,8 +586,8 @@ class MachineTest(parameterized.TestCase):
 class AloneTest(parameterized.TestCase):
     """A gait works without an environment of the suite."""
 
-    def test_a_dog_on_a_floor_of_dm_control(self):
-        arena, dog = floors.Floor(), characters.make('dog')
+    def test_a_dog_in_a_users_arena(self):
+        arena, dog = users_arena(), characters.make('dog')
         option = arena.mjcf_model.option
         option.timestep, option.gravity = controllers.GAIT_TIMESTEP / 2, (0, 0, -9.8)
         dog.create_root_joints(arena.attach(dog))

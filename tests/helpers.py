@@ -11,6 +11,7 @@ from unittest import mock
 
 import numpy as np
 from absl.testing import parameterized
+from dm_control import composer
 
 from trl_suite import suite, terrain
 from trl_suite.engine import world
@@ -43,6 +44,14 @@ STEP_WEIGHTS = {  # of the reward of footsteps
 
 MOST_KEPT = 24  # 10 to 20 MB each
 _kept = {}  # arguments -> environment, test that used it last, options (whose objects stay alive)
+
+
+def users_arena(timestep=0.002):
+    """A level arena that is none of the suite; those of dm_control.locomotion need labmaze."""
+    arena = composer.Arena(name='mine')
+    arena.mjcf_model.option.timestep = timestep
+    arena.mjcf_model.worldbody.add('geom', name='floor', type='plane', size=(0, 0, 1))
+    return arena
 
 
 def made(*parts, seed=0, flat=False, **options):

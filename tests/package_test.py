@@ -229,6 +229,7 @@ class WheelTest(FolderTest):
         for built in folder.glob('**/*.whl'):
             names = zipfile.ZipFile(built).namelist()
             self.assertNotIn('deleted', ' '.join(names))
+            self.assertNotIn('setup.py', ' '.join(names))
         shutil.rmtree(source)
 
         self.run_quietly(sys.executable, '-m', 'venv', '--without-pip', venv)
