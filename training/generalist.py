@@ -141,11 +141,13 @@ def train(
 
 def enter(ids: list[str], policy: policies.Policy, entry: dict[str, Any]) -> None:
     """Ships the policy of a character, with its results."""
-    runs.write(f'generalist/{policy.id}.json', entry)
-    policies.save(policy, runs.place(f'generalist/{policy.id}.npz'))
+    path = runs.place(f'generalist/{policy.id}.npz')
+    path.parent.mkdir(parents=True, exist_ok=True)
+    policies.save(policy, path)
     for id_ in ids:
         if id_ != policy.id:
             runs.enter(f'generalist/{policies.SHARED}', id_, {'policy': policy.id})
+    runs.write(f'generalist/{policy.id}.json', entry)
 
 
 def main() -> None:
@@ -163,9 +165,9 @@ def main() -> None:
             own = {**settings.ppo, 'samples': arguments.samples}
             settings = dataclasses.replace(settings, ppo=own)
         ids, folder = ids_of(character), arguments.runs / character
-        folder.mkdir(parents=True, exist_ok=True)
         begin = time.monotonic()
-        distilled, policy, curve = train(ids, arguments.seed, settings, folder)
+        with runs.only_run(folder):
+            distilled, policy, curve = train(ids, arguments.seed, settings, folder)
         averaged = mean_of([distilled, policy])
         found = {'distilled': distilled, 'trained': policy, 'averaged': averaged}
         made = {kind: trimmed(each) for kind, each in found.items()}

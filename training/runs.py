@@ -29,6 +29,7 @@ from trl_suite.util import files, resources
 from trl_suite.util.machine import cores
 from trl_suite.util.options import checked
 
+WRITTEN = 'checkpoint.pt', 'curve.json', 'policy.npz', 'first', '.lock'  # in the folder of a run
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
 FORMAT = b'trl_suite checkpoint 1\n'
 LARGEST = 2**32  # bytes
@@ -177,10 +178,18 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
 
 
 def remove(folder: pathlib.Path) -> None:
-    """Removes the folder of a run, unless another process trains there; see `only_run`."""
-    if folder.exists():
-        with only_run(folder):
-            shutil.rmtree(folder)
+    """Removes the folder of a run.
+
+    Raises:
+      FileExistsError: it has files, but none that a run writes.
+      RuntimeError: another process trains there; see `only_run`.
+    """
+    if not folder.exists():
+        return
+    if any(folder.iterdir()) and not any((folder / name).exists() for name in WRITTEN):
+        raise FileExistsError(f'{folder}: is not the folder of a run; remove it, or choose another')
+    with only_run(folder):
+        shutil.rmtree(folder)
 
 
 # Results in `trained/`, or in the folder TRL_SUITE_TRAINED.

@@ -672,6 +672,15 @@ class TrimTest(FolderTest):
 
 
 class ProgramsTest(FolderTest):
+    def test_only_folders_of_runs_are_removed(self):
+        (self.folder / 'thesis.txt').write_text('mine')
+        with self.assertRaisesRegex(FileExistsError, 'is not the folder of a run'):
+            runs.remove(self.folder)
+        (self.folder / 'run').mkdir()
+        (self.folder / 'run/curve.json').write_text('{}')
+        runs.remove(self.folder / 'run')
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['thesis.txt'])
+
     def test_every_program_ends_errors_in_one_line(self):
         folder = pathlib.Path(ppo.__file__).parent
         others = (

@@ -278,6 +278,9 @@ def fingerprint() -> str:
     return digest.hexdigest()[:16]
 
 
+fingerprint()  # of the sources that this process imports, which may change before it compiles
+
+
 def _forget(folder: pathlib.Path) -> None:
     """Removes the machine code of source versions that were unused for longer than `UNUSED`."""
     for path in folder.parent.iterdir():
