@@ -122,6 +122,9 @@ class GeometryTest(parameterized.TestCase):
             np.testing.assert_allclose(stage.rays(x, y), queried, atol=tolerance)
             exact = stage.arena.grounds[0].height(x, y)
             np.testing.assert_allclose(queried, exact, atol=tolerance)
+            # MuJoCo defines height fields for 0 to 1 only: contacts with others are lost.
+            self.assertGreaterEqual(stage.model.hfield_data.min(initial=0), 0)
+            self.assertLessEqual(stage.model.hfield_data.max(initial=0), 1)
         geoms = {'plane': 1, 'conveyor3d': 5, 'ramp3d': 3, 'dynamic_obstacles3d': 51}
         geoms |= {'pillars3d': 199, 'blocks3d': 59, **dict.fromkeys(GRIDS, 1)}
         self.assertLessEqual(stage.model.ngeom, geoms.get(source, 99))
