@@ -151,11 +151,11 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         **GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',), 'num_envs': 72, 'samples': 491520,
         'members': 4,
     },
-    # The first half of the cycles has random actions, also of gaits that a search has found.
+    # The first quarter of the cycles has random actions, also of gaits that a search has found.
     'FSM_Dog2D_Terrain_Stairs_Rugged-v0': {
-        **GENERALIST, 'samples': 24576, 'renew_every': 12288, 'expert_cycles': 12288,
-        'expert_epsilon': 1.0, 'gaits': ('cliffs_rugged_1', 'cliffs_rugged_2'), 'view': 5.0,
-        'final_updates': 4000, 'evaluate_every': 4096,
+        **GENERALIST, 'renew_every': 49152, 'expert_cycles': 49152, 'expert_epsilon': 1.0,
+        'substeps': 1, 'gaits': ('cliffs_rugged_1', 'cliffs_rugged_2'), 'view': 5.0,
+        'evaluate_every': 16384,
     },
     'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},
     # A hopper chooses its hops some cycles ahead. On flat ground each base action is safe for a cycle.
