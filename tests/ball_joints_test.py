@@ -171,6 +171,20 @@ class ActionMapTest(parameterized.TestCase):
         mapping = made('biped3d', 'position', action_scale=1.0).map
         np.testing.assert_array_equal(mapping.action_scale, 1.0)
 
+    def test_targets_that_are_refused(self):
+        spec = characters.CHARACTERS['biped3d']
+        for target, message in (
+            (1.0, "target of 'torso' is 1.0; expected a rotation vector, or 0"),
+            ((0.0, 9.0, 0.0), "target of 'torso' is 9; expected 0 to 1, its limits"),
+        ):
+            own = dataclasses.replace(spec.joints['torso'], target=target)
+            with self.assertRaisesRegex(ValueError, message):
+                characters.make(dataclasses.replace(spec, joints={**spec.joints, 'torso': own}))
+        with self.assertRaisesRegex(
+            ValueError, 'original_range of a joint is 1.0; expected two limits'
+        ):
+            characters.Joint(1, 1, 1, original_range=1.0)
+
     def test_working_posture_of_a_ball_joint(self):
         spec = characters.CHARACTERS['biped3d']
         joints = dict(spec.joints)
