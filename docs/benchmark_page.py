@@ -219,7 +219,7 @@ def main() -> None:
     if arguments.check:
         drawn = all(shown(name) in (FOLDER / f'{name}.svg').read_text() for name in FIGURES)
         sys.exit(old != new or rounded(files.read_json(stored)) != rounded(found) or not drawn)
-    files.write_json(found, stored)
+    files.write_json(found, stored, indent=None)
     pictures(found)
     files.write_text(new, PAGE)
 
