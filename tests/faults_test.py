@@ -44,7 +44,7 @@ SETTINGS = Settings(
     evaluation_episodes=2,
 )  # fmt: skip
 SIGNALS = signal.SIGKILL, signal.SIGINT, signal.SIGTERM
-PART = r'\..*\.part(\.\w+)?|\.lock|\..*\.lock'  # what SIGKILL may leave
+PART = r'\..*\.part(\.\w+)?|\.lock|\..*\.lock|\.trl_suite_state'  # what SIGKILL may leave
 
 
 class Learner:

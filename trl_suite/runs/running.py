@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import os
 import pathlib
-import shutil
 import sys
 import tempfile
 import time
@@ -316,14 +315,20 @@ def _forget(path: pathlib.Path, done: int) -> None:
 def _remove(folder: pathlib.Path) -> None:
     """Removes a learner's state, and no other folder."""
     if (folder / MARK).is_file():
-        shutil.rmtree(folder, ignore_errors=True)
+        with _beside(folder) as outer:  # a killed process leaves a whole state, or none
+            os.replace(folder, pathlib.Path(outer, folder.name))
+
+
+def _beside(path: pathlib.Path) -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(
+        prefix=f'.{path.name}.', suffix='.part', dir=path.parent, ignore_cleanup_errors=True
+    )
 
 
 @contextlib.contextmanager
 def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary folder that replaces `path` if no exception is raised."""
-    prefix = f'.{path.name}.'
-    with tempfile.TemporaryDirectory(prefix=prefix, suffix='.part', dir=path.parent) as outer:
+    with _beside(path) as outer:
         part = pathlib.Path(outer, path.name)
         part.mkdir()
         yield part
