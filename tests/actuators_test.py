@@ -11,7 +11,8 @@ import numpy as np
 from absl.testing import parameterized
 from dm_control import mjcf
 from engine_test import XML
-from helpers import assert_refused, assert_uniform
+from gait_test import around_physics
+from helpers import EVERY_MOTOR, assert_refused, assert_uniform
 
 from trl_suite import actuation, characters, suite
 from trl_suite.actuation import realism, series, strength_curves
@@ -23,10 +24,6 @@ PLANAR = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 MUSCLE = 'MTU_Biped2D_LLC_Imitate_Flat-v0'
 GAIT = 'FSM_Dog2D_Terrain_Gaps-v0'
 CHARACTERS = ('biped2d', 'biped3d')
-ALL = {
-    'torque_speed': True, 'no_load_speed': 8.0, 'strength': (0.7, 1.3), 'noise': 0.1, 'delay': (0, 60),
-    'torque_pose': True, 'flex': 0.05, 'backlash': 0.02,
-}  # fmt: skip
 
 
 def make(character='biped2d', model='position', task='imitation', **options):
@@ -131,7 +128,7 @@ class OptionsTest(parameterized.TestCase):
     def test_terrain_and_start_do_not_depend_on_the_option(self):
         gaps = 'PD_Biped2D_Gaps_Terrain-v0'
         plain = suite.make(gaps, task_kwargs={'random': 4})
-        given = suite.make(gaps, task_kwargs={'random': 4, 'actuators': ALL})
+        given = suite.make(gaps, task_kwargs={'random': 4, 'actuators': EVERY_MOTOR})
         for _ in range(2):
             # Springs and play add bodies, which round differently.
             np.testing.assert_allclose(flat(plain.reset()), flat(given.reset()), atol=1e-9)
@@ -233,19 +230,27 @@ class TorqueSpeedTest(parameterized.TestCase):
         self.assertGreater(saturated, 10)
 
     def test_gaits_have_the_limits_at_every_physics_step(self):
-        environment = make('dog', None, 'gait', torque_speed=True, no_load_speed=5.0)
-        model, seen = environment.physics.model.ptr, []
+        environment = make(
+            'dog', None, 'gait', torque_speed=True, no_load_speed=self.NO_LOAD, braking=self.BRAKING
+        )
+        model, data = environment.physics.model.ptr, environment.physics.data.ptr
+        character = environment.task.character
+        names = [f'dog/{name}' for name in character.spec.joints]
+        motors = [model.actuator(name).id for name in names]
+        dofs = [model.joint(name).dofadr[0] for name in names]
+        rates, ranges = [], []
+        around_physics(
+            environment,
+            before=lambda: rates.append(data.qvel[dofs]),
+            after=lambda: ranges.append(model.actuator_forcerange[motors]),
+        )
         environment.step(np.zeros(len(environment.action_map)))
-        data = environment.physics.data.ptr
-        # The ranges were written for the velocities before the last physics step.
-        for k, name in enumerate(environment.task.character.spec.joints):
-            low, high = model.actuator(f'dog/{name}').forcerange
-            limit = environment.task.character.torque_limits[k]
-            self.assertBetween(-low / limit, 0, 1.5)
-            self.assertBetween(high / limit, 0, 1.5)
-            self.assertBetween(data.actuator_force[k], low, high)
-            seen += [high / limit, -low / limit]
-        self.assertGreater(np.ptp(seen), 0.1)
+        self.assertGreater(len(rates), 100)
+        rates, relative = np.array(rates), np.array(ranges) / character.torque_limits[:, None]
+        for sign, found in ((1, relative[..., 1]), (-1, -relative[..., 0])):
+            expected = np.clip(1 - sign * rates / self.NO_LOAD, 0, self.BRAKING)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+            self.assertGreater(np.ptp(found), 0.5)
 
 
 class TorquePoseTest(parameterized.TestCase):
@@ -410,6 +415,20 @@ class DelayTest(parameterized.TestCase):
                 applied = self.servo(environment, 3, given[max(0, (s - lag) // per)], qpos, qvel)
                 self.assertAlmostEqual(data.actuator_force[3], applied, places=9)
             np.testing.assert_array_equal(task.world.ctrl[0], given[-1])  # as the task wrote it
+
+    @parameterized.parameters(
+        (GAIT, 2), ('PD_Biped3D_HLC_Forest-v0', 10), (PLANAR, 10),
+    )  # fmt: skip
+    def test_enough_controls_are_stored(self, id_, steps):
+        """Of a delay of 60 ms, or 2 ms in gaits, with a control every so many physics steps."""
+        delay = 2 if id_ == GAIT else 60
+        environment = suite.make(id_, task_kwargs={'random': 1, 'actuators': {'delay': (0, delay)}})
+        environment.reset()
+        task = environment.task
+        lag = round(delay / 1000 / task.physics_timestep)
+        self.assertEqual(task.steps_per_call, steps)
+        # Those of the delay, which may end within a step, and the current one.
+        self.assertLen(task.world.engine.motors.state.controls[0], lag // steps + 2)
 
     def servo(self, environment, k, target, qpos, qvel):
         character = environment.task.character

@@ -19,14 +19,27 @@ import trl_suite.gym
 from trl_suite import sequences, suite
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
+REALISTIC = [
+    'ideal',
+    'torque_speed',
+    'torque_pose',
+    'delay',
+    'flex',
+    'backlash',
+    'noise',
+    'strength',
+    'all',
+]
 FLAT, GAPS = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0'
 
 
 def needs(module, extra):
     """Skips a class of tests where the extra is not installed."""
-    return unittest.skipUnless(
-        importlib.util.find_spec(module), f"needs {module}: pip install 'trl_suite[{extra}]'"
-    )
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return unittest.skip(f"needs {module}: pip install 'trl_suite[{extra}]'")
+    return lambda tested: tested
 
 
 def run_page(word):
@@ -81,6 +94,10 @@ class ExamplesTest(absltest.TestCase):
         self.assertNotEmpty(paths := [*EXAMPLES.glob('*.py')])
         for path in paths:
             self.assertLessEqual(len(path.read_text().splitlines()), 60, path.name)
+
+    def test_actuators(self):
+        out = run_example('real_actuators', '--episodes', '1')
+        self.assertEqual([line.split()[0] for line in out.splitlines()], REALISTIC)
 
 
 @needs('torchrl', 'torchrl')
@@ -174,12 +191,13 @@ class ShimmyTest(parameterized.TestCase):
         self.assertEndsWith(out, 'picture of shape (240, 320, 3)\n')
 
 
-@needs('ray', 'rllib')
+@needs('ray.rllib', 'rllib')
 class RLlibTest(absltest.TestCase):
     def test_configuration(self):
-        configuration = load('rllib_ppo').configuration(GAPS, runners=3, num_envs=8, seed=7)
-        configuration.validate()
-        self.assertEqual(configuration.total_train_batch_size, 3 * 8 * 32)
+        for name, runners in (('rllib_ppo', 3), ('rllib_appo', 1)):  # in a batch
+            configuration = load(name).configuration(GAPS, runners=3, num_envs=8, seed=7)
+            configuration.validate()
+            self.assertEqual(configuration.total_train_batch_size, runners * 8 * 32)
 
     @pytest.mark.slow
     def test_two_runners_on_ground_of_their_own(self):

@@ -160,6 +160,27 @@ class DoctorTest(CommandTest):
         self.assertEqual(found.state, doctor.NOTE)
         self.assertIn('NUMBA_CACHE_DIR', found.remedy)
 
+    def test_findings(self):
+        """All of them; what runs in other processes is replaced."""
+        ends = {doctor._DRAW: (0, 'Mesa', ''), doctor._RUN: (1, '', 'no engine')}
+        with (
+            mock.patch.object(doctor, '_start', lambda code, *_: code),
+            mock.patch.object(doctor, '_end', lambda code: ends[code]),
+        ):
+            found = list(doctor.findings())
+        self.assertEqual(
+            [each.text for each in found if each.state == doctor.FAILED],
+            ['no environment runs: no engine'],
+        )
+        text = '\n'.join(each.text for each in found)
+        for name in ('Python 3', 'mujoco ', "extra 'video'", ' cores usable', 'MUJOCO_GL=osmesa'):
+            self.assertIn(name, text)
+        for lacks, state in ((True, doctor.NOTE), (False, doctor.OK)):
+            with mock.patch.object(doctor.resources, 'lacks_policies', return_value=lacks):
+                found = doctor.shipped_policies()
+            self.assertEqual(found.state, state)
+            self.assertIn(f'policies for {len(doctor.policies.available())} env', found.text)
+
     def test_exit_status(self):
         good, bad = doctor.Finding('ok', 'fine'), doctor.Finding('FAILED', 'no engine', 'mend it')
         for found, status, last in (

@@ -278,11 +278,15 @@ class LockTest(FolderTest):
 
     def test_a_wait_has_a_limit(self):
         """A process that was stopped keeps its locks. Only the first is waited for."""
-        self.enter_context(mock.patch.object(machine_code, 'limit', 0.3))
+        self.enter_context(mock.patch.object(machine_code, 'limit', 8 * machine_code._TICK))
+        clock = self.enter_context(mock.patch.object(machine_code, 'time'))
+        clock.now = 0.0
+        clock.monotonic = lambda: clock.now
+        clock.sleep = lambda seconds: setattr(clock, 'now', clock.now + seconds)
         self.busy = mock.Mock(return_value=True)
         self.assertEqual(fresh()(1.0), 7.0)
         self.assertEqual(machine_code.limit, 0.0)
-        self.assertBetween(self.busy.call_count, 3, 12)
+        self.assertBetween(self.busy.call_count, 8, 10)
         # This disk has no locks.
         self.busy = mock.Mock(side_effect=OSError(errno.ENOLCK, 'no locks'))
         self.assertEqual(fresh()(1.0), 7.0)

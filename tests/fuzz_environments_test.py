@@ -16,6 +16,7 @@ import hypothesis
 import numpy as np
 import pytest
 from absl.testing import parameterized
+from helpers import ONE_OF_EACH
 from hypothesis import stateful
 from hypothesis import strategies as st
 
@@ -35,7 +36,6 @@ SPECS = {
     'spatial_walk': suite.combine('biped3d', task='walk'),
     **{spec.task_type: spec for spec in catalogue.SPECS},
 }  # one of each task type
-IDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 REALISTIC = {
     'actuators': {'strength': (0.7, 1.3), 'delay': (0, 2), 'noise': 0.05},
@@ -308,19 +308,19 @@ class SlowTest(parameterized.TestCase):
     def test_options(self, task_type):
         drawn(option_test(task_type), SLOW)
 
-    @parameterized.parameters(*IDS)
+    @parameterized.parameters(*ONE_OF_EACH)
     def test_worlds_and_sensors(self, id_):
         drawn(disturbance_test(id_), SLOW)
 
-    @parameterized.parameters(*IDS)
+    @parameterized.parameters(*ONE_OF_EACH)
     def test_arguments(self, id_):
         drawn(argument_test(id_), SLOW)
 
-    @parameterized.parameters(*IDS)
+    @parameterized.parameters(*ONE_OF_EACH)
     def test_states(self, id_):
         drawn(state_test(id_), SLOW)
 
-    @parameterized.product(id_=IDS, realistic=(False, True))
+    @parameterized.product(id_=ONE_OF_EACH, realistic=(False, True))
     def test_calls(self, id_, realistic):
         seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
         print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={SLOW}')

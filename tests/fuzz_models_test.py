@@ -7,6 +7,7 @@ The grammar of MJCF is dm_control's schema. One file of each kind is always the 
 import os
 import pathlib
 import random
+import re
 import struct
 import tempfile
 import time
@@ -207,6 +208,9 @@ def check(path):
         row = characters.from_file(path, **LINKS)
     except ValueError as error:
         assert str(error).startswith(f'{path}: '), error
+        assert not re.search(
+            ': (Assertion|Attribute|Index|Key|Name|Type|ZeroDivision)Error:', str(error)
+        ), error
         return str(error)
     finally:
         assert time.perf_counter() - begin < limited.WAIT

@@ -31,6 +31,11 @@ EVERY_PROPERTY = {  # all of a world that can be varied
     'contact_depth': (0.001, 0.01), 'contact_time': (0.005, 0.02),
     'push': {'force': (50, 200), 'duration': (0.02, 0.2), 'interval': (0.0, 0.3)},
 }  # fmt: skip
+EVERY_MOTOR = {  # what can be varied of motors
+    'torque_speed': True, 'no_load_speed': 8.0, 'strength': (0.7, 1.3), 'noise': 0.1, 'delay': (0, 60),
+    'torque_pose': True, 'flex': 0.05, 'backlash': 0.02,
+}  # fmt: skip
+ONE_OF_EACH = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())  # task type
 STEP_WEIGHTS = {  # of the reward of footsteps
     name: weight / 1.05
     for name, weight in (
@@ -83,7 +88,7 @@ def in_this_process(function, *arguments):
     """In place of `limited.call`, whose child process takes most of the time of reading a character."""
     try:
         return pickle.loads(pickle.dumps(function(*arguments)))
-    except Exception as error:
+    except (ValueError, OSError) as error:
         raise ValueError(' '.join(str(error).split())) from None
 
 

@@ -4,8 +4,10 @@ import contextlib
 import dataclasses
 import fractions
 import json
+import math
 import os
 import resource
+import shutil
 import struct
 import sys
 import time
@@ -320,6 +322,23 @@ class LimitsTest(FolderTest):
     @parameterized.parameters('replicate', 'attach_attached', 'doubling', 'keys', 'endless', 'pipe')
     def test_character_files(self, name):
         self.check_character_file(name)
+
+    @parameterized.parameters(
+        (os.abort, (), ValueError, 'reading it failed: Aborted; expected what can be read in'),
+        (os._exit, (3,), ValueError, 'reading it failed: status 3; expected'),
+        (math.sqrt, (-1,), ValueError, 'math domain error|expected a nonnegative'),
+        (math.factorial, ('1',), ValueError, 'TypeError: .*; expected what can be read'),
+    )  # fmt: skip
+    def test_functions_that_fail(self, function, arguments, kind, message):
+        with self.assertRaisesRegex(kind, message):
+            limited.call(function, *arguments)
+
+    def test_a_process_that_does_not_start(self):
+        with (
+            mock.patch.object(sys, 'executable', shutil.which('false')),
+            self.assertRaisesRegex(RuntimeError, "process of '.*false' does not start: status 1"),
+        ):
+            limited.call(math.sqrt, 4)
 
     def check_character_file(self, name):
         path = self.folder / 'm.xml'

@@ -115,7 +115,7 @@ class DiscoveryTest(absltest.TestCase):
         self.assertNotIn('test_long_random_rollout', ' '.join(found))
         result = unittest.TestResult()
         with mock.patch.dict(os.environ):
-            del os.environ['PYTEST_CURRENT_TEST']
+            os.environ.pop('PYTEST_CURRENT_TEST', None)
             found['imitation_test.ResetTest.test_on_the_ground_and_not_below0'].run(
                 result
             )  # uses `helpers.made`
@@ -125,24 +125,10 @@ class DiscoveryTest(absltest.TestCase):
 class ImportTest(parameterized.TestCase):
     """Importing is quick, quiet and needs no display."""
 
-    def test_import_is_fast_and_silent(self):
-        code = """
-            import time
-            start = time.perf_counter()
-            import trl_suite
-            seconds = time.perf_counter() - start
-            import sys
-            assert 'mujoco' not in sys.modules, 'the engine is imported on first use'
-            sys.stdout.write(str(seconds))
-        """
-        seconds = []
-        for _ in range(3):  # the best of three: the machine may be busy
-            out, err = python(code)
-            self.assertEqual(err, '')
-            seconds.append(float(out))
-        self.assertLess(min(seconds), 1.5)
-
     @parameterized.parameters(
+        # Large libraries, which take seconds, are imported on first use.
+        ("import sys, trl_suite; print({'mujoco', 'dm_control', 'numba', 'scipy'} & {*sys.modules})",
+         {}, 'set()'),
         # Needs no engine, nor the extra that trains.
         ("""
             import sys

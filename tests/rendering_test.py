@@ -117,7 +117,9 @@ class CameraTest(parameterized.TestCase):
         physics = self.physics()
         angle = physics.model.ptr.cam_fovy
         with cameras.outside_obstacles(physics, 0):
-            half = -physics.data.cam_xpos[0, 1] * np.tan(np.deg2rad(angle[0]) / 2)
+            place = physics.data.cam_xpos[0].copy()
+            half = -place[1] * np.tan(np.deg2rad(angle[0]) / 2)
+        np.testing.assert_allclose(place, [0, -2 + cameras.MARGIN, 0], atol=1e-3)
         self.assertAlmostEqual(half, 3 * np.tan(np.deg2rad(20)), places=6)
         self.assertEqual(angle[0], 40)
         np.testing.assert_array_equal(physics.data.cam_xpos[0], [0, -3, 0])
@@ -125,9 +127,18 @@ class CameraTest(parameterized.TestCase):
     def test_cameras_of_frames_are_in_no_block(self):
         environment = suite.make('PD_Biped3D_HLC_LargeBlocks-v0', task_kwargs={'random': 3})
         environment.reset()
-        with mock.patch.object(cameras, 'free_place', wraps=cameras.free_place) as moved:
+        physics, seen = environment.physics, []
+        camera = rendering.drawing.check_options(physics.model.ptr, environment.task, camera='back')
+
+        def render(*arguments, **options):
+            seen.extend(physics.data.cam_xpos[camera])
+
+        with (
+            mock.patch.object(cameras, 'free_place', return_value=np.array([1.0, 2.0, 3.0])),
+            mock.patch.object(physics, 'render', render),
+        ):
             rendering.frame(environment, 48, 64, 'back')
-        moved.assert_called_once()
+        self.assertEqual(seen, [1.0, 2.0, 3.0])
 
 
 class GhostTest(parameterized.TestCase):

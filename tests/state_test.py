@@ -13,14 +13,20 @@ import helpers
 import numpy as np
 from absl.testing import parameterized
 from dm_control.composer.observation import observable
-from helpers import EVERY_PROPERTY, LONG, advance, assert_rows_are_singles
+from helpers import (
+    EVERY_MOTOR,
+    EVERY_PROPERTY,
+    LONG,
+    ONE_OF_EACH,
+    advance,
+    assert_rows_are_singles,
+)
 
 from trl_suite import motion, suite
 from trl_suite.characters import CHARACTERS
 from trl_suite.engine import world
 from trl_suite.environments import states
 from trl_suite.environments.environment import Environment
-from trl_suite.registry import catalogue
 from trl_suite.tasks import parts
 from trl_suite.terrain import from_function, from_heights, load
 from trl_suite.util import machine
@@ -28,7 +34,6 @@ from trl_suite.vector import VectorEnvironment
 
 GAITS = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0')
 DOG, FLAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Biped2D_LLC_Imitate_Flat-v0'
-ONE_OF_EACH = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())
 BROKEN = (('qvel', 1e12), ('qvel', np.nan), ('qpos', 1e12), ('qpos', np.nan))
 
 
@@ -100,11 +105,7 @@ RUNNERS = (
     'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0', 'FSM_Hopper2D_Terrain_Mixed_Easy-v0',
 )  # fmt: skip
 WORLD = {'randomize': EVERY_PROPERTY, 'sensors': {'preset': 'harsh', 'delay': (0, 3)}}
-MOTORS = {
-    'torque_speed': True, 'no_load_speed': 8.0, 'strength': (0.7, 1.3), 'noise': 0.1, 'delay': (0, 60),
-    'torque_pose': True, 'flex': 0.05, 'backlash': 0.02,
-}  # fmt: skip
-OF_MUSCLES = {name: MOTORS[name] for name in ('strength', 'noise', 'delay')}
+OF_MUSCLES = {name: EVERY_MOTOR[name] for name in ('strength', 'noise', 'delay')}
 # For gaits, too.
 LATE = {'torque_speed': True, 'delay': (0, 2), 'noise': 0.02, 'strength': (0.9, 1.1)}
 OWN = {  # of users
@@ -131,10 +132,10 @@ VARIANTS = (
     *((id_, WORLD) for id_ in (HILLS, MOVERS, SOCCER)),
     (GENERAL, {**WORLD, 'pushes': {'interval': (0.1, 0.2)}}),
     *((id_, {**WORLD, 'actuators': LATE}) for id_ in (GAPS, GAITS[0], GENERAL, FOREST)),
-    *((id_, {'actuators': MOTORS}) for id_ in (FLAT, IMITATE.format(''))),
+    *((id_, {'actuators': EVERY_MOTOR}) for id_ in (FLAT, IMITATE.format(''))),
     (FLAT, {'actuators': {'noise': 0.1}}), (FLAT, {'actuators': {'delay': (0, 60)}}),
     (IMITATE.format(''), {'actuators': {'flex': 0.05}}), (MUSCLES, {'actuators': OF_MUSCLES}),
-    (SOCCER, {'actuators': MOTORS}), (suite.combine('dog', terrain='gaps', task='walk'), OWN),
+    (SOCCER, {'actuators': EVERY_MOTOR}), (suite.combine('dog', terrain='gaps', task='walk'), OWN),
 )  # fmt: skip
 
 

@@ -8,15 +8,13 @@ import sys
 
 import numpy as np
 from absl.testing import parameterized
-from helpers import assert_refused
+from helpers import ONE_OF_EACH, assert_refused
 
 from trl_suite import suite, terrain
-from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
-KINDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())  # one id of each task
 IDLE = np.zeros((3, 6))  # actions of FLAT
 
 
@@ -159,7 +157,7 @@ class AutoresetTest(parameterized.TestCase):
 class PartialBatchTest(parameterized.TestCase):
     """Stepping some simulations, and going on where another environment is: what a search needs."""
 
-    @parameterized.parameters(*KINDS)
+    @parameterized.parameters(*ONE_OF_EACH)
     def test_some_simulations(self, id_):
         """Simulation 1 rests every other step, and is no other for it than one that never rests.
 
