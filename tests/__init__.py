@@ -19,6 +19,9 @@ def load_tests(
     loader: unittest.TestLoader, tests: unittest.TestSuite, pattern: str | None
 ) -> unittest.TestSuite:
     """Finds the same tests as pytest: those in files *_test.py that are not marked as slow."""
+    import conftest
+
+    conftest.pytest_configure()
     found = loader.discover(FOLDER, '*_test.py')
     tests.addTests(test for test in flat(found) if not is_slow(test))
     gc.freeze()  # as in conftest.py

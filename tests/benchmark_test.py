@@ -52,6 +52,8 @@ class CoreTest(parameterized.TestCase):
         with mock.patch.object(core, 'scales', return_value={ID: of}):
             self.assertAlmostEqual(benchmark.normalised(ID, 0.45), 0.5)
             self.assertAlmostEqual(benchmark.normalised(ID, 0.1), -0.2)
+        with self.assertRaisesRegex(ValueError, f"'{ID[:-3]}s-v0'.*{ID}"):
+            benchmark.normalised(f'{ID[:-3]}s-v0', 0.4)
 
     def test_step_limits(self):
         self.assertEqual(benchmark.get(ID).spec(ID).step_limit, 256)

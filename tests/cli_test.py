@@ -468,7 +468,7 @@ class EvaluateTest(CommandTest):
         ('seed is -1; expected a whole', GAPS, '--policy', 'zero', '--seed', '-1'),
         ('num_threads is -1', GAPS, '--policy', 'zero', '--threads', '-1'),
         ('step_limit is given twice', GAPS, '--option', 'step_limit=3', '--step-limit', '2'),
-        ("key 'levels' is given twice", GAPS, '--option', 'levels=[0,3]', '--option', 'levels=[0,4]'),
+        ("key 'levels' is given twice", GAPS, *2 * ('--option', 'levels=[0,3]')),
         ("the folder 'no' does not exist", GAPS, '--json', 'no/a.json'),
     )
     def test_errors_leave_no_files(self, message, *arguments):

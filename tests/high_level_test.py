@@ -23,7 +23,7 @@ from helpers import (
     made,
 )
 
-from trl_suite import policies, rendering, suite
+from trl_suite import motion, policies, rendering, suite
 from trl_suite.controllers import footstep_controller
 from trl_suite.policies import files as policy_files
 from trl_suite.tasks.navigation import hierarchical, scripted
@@ -734,6 +734,14 @@ class OptionTest(FolderTest):
         def ball(name):
             return functools.partial(suite.build, 'biped3d_mocap', terrain=name, task='soccer')
 
+        def slow(character):
+            steps = motion.load_steps(character)
+            times = steps.times * 3 / steps.duration
+            steps = dataclasses.replace(steps, times=times)
+            suite.build(
+                character, task='goal_navigation', clip=steps, task_kwargs={'controller': idle}
+            )
+
         def script(id_, **options):
             return functools.partial(scripted.scripted, made(id_, **options))
 
@@ -755,6 +763,7 @@ class OptionTest(FolderTest):
             (script(FOREST, interface='frame'), "needs the interface 'plan', not 'frame'"),
             (lambda: rendering.frame(started(FOREST)[0], 60, 80, ghost=True),
              'the task HierarchicalNavigation has no reference clip'),
+            (lambda: slow('biped3d_mocap'), 'a step takes 3 s; expected at most 2 s'),
             (lambda: started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0'),
              f"did you mean '{hierarchical.CONTROLLER}'"),
             (lambda: started(PLANE, controller='stand'),

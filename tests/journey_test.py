@@ -168,6 +168,8 @@ class RewardTest(parameterized.TestCase):
             environment.step(action)
             found = environment.info['reward_terms']
             self.assertAlmostEqual(found['dribble'], dribble * 0.5 * 0.4 / 1.2, delta=2e-3)
+            moved = environment.physics.named.data.xpos['ball'][0] - ball[0]
+            self.assertAlmostEqual(environment.info['speed'], 30 * moved, delta=1e-6)
 
 
 class GoalTest(parameterized.TestCase):

@@ -27,6 +27,7 @@ from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import inspect, model_file
 from trl_suite.describe import tasks
 from trl_suite.motion import quaternion
+from trl_suite.registry import build
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk import task as walk
 from trl_suite.tasks.walk.task import Walk
@@ -951,6 +952,21 @@ class TaskTest(parameterized.TestCase):
         )
         with self.assertRaisesRegex(ValueError, "unknown option .*'action_scal'.*'action_scale'"):
             suite.build(character, task=Rise, task_kwargs={'action_scal': 1})
+
+    def test_a_users_own_function(self):
+        """Its further arguments are options, by keyword or not."""
+        given = []
+
+        def rise(character, arena, actuation_model='position', height=0.3, *, weight=1.0):
+            given.append((height, weight))
+            return Rise(character, arena, actuation_model=actuation_model)
+
+        spec = suite.combine('biped2d', task=rise)
+        self.assertEqual([*build.task_options(spec)], ['height', 'weight'])
+        suite.build('biped2d', task=rise, task_kwargs={'height': 0.5, 'weight': 2.0})
+        self.assertEqual(given[-1], (0.5, 2.0))
+        with self.assertRaisesRegex(ValueError, "unknown option .*'hight'.*'height'"):
+            suite.build('biped2d', task=rise, task_kwargs={'hight': 0.5})
 
     def test_walking_is_rewarded(self):
         environment = suite.build('biped3d', task='walk', task_kwargs={'random': 1})

@@ -50,13 +50,17 @@ def scales() -> dict[str, dict[str, Any]]:
 
 
 def ends(id: str) -> tuple[float, float]:
-    """Returns the scores that are 0, the better of random and default action, and 1, the shipped policy's."""
-    of = scales()[id]
+    """Returns the scores that are 0, the better of random and default action, and 1, the shipped policy's.
+
+    Raises:
+      ValueError: the environment is not in the core set.
+    """
+    of = scales()[BENCHMARK.get(id).name]
     return max(of['zero'], of['random']), of['shipped']
 
 
 def normalised(id: str, score: float) -> float:
-    """Returns a score on the scale of `ends`."""
+    """Returns a score on the scale of `ends`; raises the same error."""
     low, high = ends(id)
     return (score - low) / (high - low)
 

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     result['policy'] = arguments.policy
     if arguments.json is not None:
         given = {'options': options_of(arguments)} if arguments.options else {}
-        files.write_json({**result, **given}, arguments.json)
+        files.write_json({'trl_suite': trl_suite.__version__, **result, **given}, arguments.json)
     returns, distances = result['return_interval'], result['distance_interval']
     around = '' if returns is None else f' +- {returns:.2f} (95 % confidence)'
     between = ''

@@ -37,7 +37,12 @@ def declare(commands: Any) -> None:
     command = add_command(commands, 'rollout', 'run a policy for a number of steps', run)
     add_id(command)
     command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
-    command.add_argument('--steps', type=positive, default=256, help='number of control steps')
+    command.add_argument(
+        '--steps',
+        type=positive,
+        default=256,
+        help='number of steps: of 1/30 s, of cycles in gaits, of footsteps in planning',
+    )
     add_policy(command, 'random')
     add_options(command)
     add_file(command, '--video', 'write a video, .mp4 or .gif', *rendering.VIDEO_SUFFIXES)

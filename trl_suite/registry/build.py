@@ -52,10 +52,11 @@ def task_options(spec: EnvSpec) -> dict[str, tuple[Any, Mapping[str, Any]]]:
     """
     config = config_of(spec)
     if config is None:
-        known = {
-            name: (parameter.default, option(None, '').metadata)
-            for name, parameter in inspect.signature(spec.own['task_type']).parameters.items()
-            if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
+        known = {  # after character and arena
+            name: (each.default, option(None, '').metadata)
+            for name, each in [*inspect.signature(spec.own['task_type']).parameters.items()][2:]
+            if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)
+            and name not in ('actuation_model', 'clip')
         }
     else:
         known = {each.name: (each.default, each.metadata) for each in dataclasses.fields(config)}

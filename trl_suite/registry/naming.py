@@ -1,7 +1,10 @@
 """Names of characters and gaits in ids and descriptions, and which ids the original registers."""
 
 # Names of characters in the original's ids, and words for the gaits in descriptions.
-NAMES = {'biped2d': 'Biped2D', 'biped2d_full': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D'}
+NAMES = {
+    'biped2d': 'Biped2D', 'biped2d_full': 'Biped2D', 'biped2d_simbicon': 'Biped2D', 'dog': 'Dog2D',
+    'goat': 'Goat2D', 'hopper': 'Hopper2D', 'raptor': 'Raptor2D',
+}  # fmt: skip
 GAITS = {
     'biped2d_walk': 'walk',
     'biped2d_run': 'run',

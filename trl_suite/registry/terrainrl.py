@@ -5,6 +5,7 @@ Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 
 from __future__ import annotations
 
+from trl_suite.registry.naming import NAMES
 from trl_suite.registry.spec import EnvSpec
 
 # Cycles: 5 to 10 km, several times the mean distance of any shipped policy before a fall.
@@ -21,13 +22,6 @@ _GAIT_TERRAINS = (
     ('Walls', 'walls', 'walls'),
     ('Steps', 'steps', 'steps up and down'),
 )
-_NAMES = {  # in ids
-    'biped2d_simbicon': 'Biped2D',
-    'dog': 'Dog2D',
-    'raptor': 'Raptor2D',
-    'hopper': 'Hopper2D',
-    'goat': 'Goat2D',
-}
 _ON_ALL_TERRAINS = ('biped2d_simbicon', 'dog', 'raptor', 'hopper')
 _MORE_GAITS = (
     ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
@@ -45,7 +39,7 @@ _MORE_GAITS = (
 
 
 def _gait(character: str, name: str, preset: str, words: str, origin: str) -> EnvSpec:
-    figure = _NAMES[character]
+    figure = NAMES[character]
     return EnvSpec(
         id=f'FSM_{figure}_Terrain_{name}-v0',
         domain='terrainrl',

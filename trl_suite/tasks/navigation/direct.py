@@ -123,8 +123,9 @@ def compare(i: int, data: DirectData) -> None:
     score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
     give(i, facing(off), terms.heading, outcome)
     score(i, squared / (NEAR * NEAR), terms.proximity, outcome)
-    along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
-    data.aims.goals.speed[i] = along / max(distance, 1e-9)
+    if not data.aims.with_ball:
+        along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
+        data.aims.goals.speed[i] = along / max(distance, 1e-9)
 
 
 @compiled
@@ -150,7 +151,9 @@ def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
         if proceed(i, tracking):
             store_trace(i, steps[i], measurement, aims.goals)
             if aims.with_ball:
-                dribble(i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome)
+                seconds, outcome = CONTROL_TIMESTEP, tracking.outcome
+                speed = dribble(i, seconds, data.physics, measurement, aims, outcome)
+                aims.goals.speed[i] = speed
             wanted += test_goal(i, steps[i], measurement, aims)
     return wanted
 

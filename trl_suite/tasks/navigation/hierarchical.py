@@ -184,6 +184,11 @@ class HierarchicalNavigation(GoalTask):
                 f'controller: a list of {count}, with the interface {self.interface!r}; expected at least '
                 "one, or with the interface 'frame' exactly one"
             )
+        longest = rules.LONGEST * CONTROL_TIMESTEP
+        if steps.duration > longest:
+            raise ValueError(
+                f'{steps.name}: a step takes {steps.duration:g} s; expected at most {longest:g} s'
+            )
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         joints = None if by_plan else self.joint_map
@@ -309,7 +314,8 @@ class HierarchicalNavigation(GoalTask):
         With the interface 'frame', a footstep controller can thus observe a plan before it acts.
 
         Args:
-          action: (n, k), in [-1, 1]; numbers after the plan are ignored.
+          action: (n, k), in [-1, 1]; with several controllers the plan chooses one, other numbers after it
+            are ignored.
 
         Returns:
           Observation of the footstep controller, (n, size); the observation is updated as well.
