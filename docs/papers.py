@@ -12,6 +12,7 @@ import numpy as np
 
 from trl_suite.util import files
 from trl_suite.util.tables import markdown_table as table
+from trl_suite.util.tables import share
 
 RUNS = pathlib.Path(__file__).resolve().parent / 'continual'
 # Action spaces (2017), supplement, table 4: normalised reward, mean ± standard deviation over 32
@@ -158,14 +159,38 @@ def plans() -> str:
     rows = []
     for id, found in gallery.record('plans').items():
         if 'scripted' in found:
-            react = found.get(f'reference with {controllers("React")}')
+            kinds = 'scripted', 'reference', f'reference with {controllers("React")}'
+            each = scripted, trained, react = [found.get(kind) for kind in kinds]
             rows.append((
-                f'`{id}`', *(f'{found[policy]["reward"]:.2f}' for policy in ('scripted', 'reference')),
-                f'{found["reference"]["survived"]:.0%}',
-                *(('–', '–') if react is None else (f'{react["reward"]:.2f}', f'{react["survived"]:.0%}')),
+                f'`{id}`', counts(each), score(scripted), score(trained), lasting(trained), score(react),
+                lasting(react),
             ))  # fmt: skip
-    columns = 'score, scripted', 'score, trained', 'no fall', 'score, react', 'no fall, react'
+    columns = (
+        'episodes: scripted / trained / react', 'score, scripted', 'score, trained', 'no fall',
+        'score, react', 'no fall, react',
+    )  # fmt: skip
     return table(('planner', *columns), rows)
+
+
+def counts(found: Iterable[dict[str, Any] | None]) -> str:
+    """Returns the numbers of episodes of results."""
+    return ' / '.join('–' if each is None else str(each['episodes']) for each in found)
+
+
+def score(found: dict[str, Any] | None) -> str:
+    return '–' if found is None else f'{found["reward"]:.2f}'
+
+
+def lasting(found: dict[str, Any] | None) -> str:
+    """Returns the share of episodes without a fall."""
+    return '–' if found is None else share(found['survived'], found['episodes'])
+
+
+def in_episodes(found: Iterable[dict[str, Any]], head: Iterable[str], rows: Iterable[Any]) -> str:
+    """Returns a table of results that all have the same number of episodes, and this number."""
+    [(count, seconds)] = {(each['episodes'], each['seconds']) for each in found}
+    text = f'{count} episodes of {seconds:g} s each; shares without a fall with 95 % intervals (Wilson):'
+    return f'{text}\n\n{table(head, rows)}'
 
 
 def foresight() -> str:
@@ -177,10 +202,12 @@ def foresight() -> str:
         ))
         for id, each in found.items()
     ]  # fmt: skip
-    one = next(iter(found.values()))
+    [(asked, budget, count)] = {
+        (each['asked'], each['budget'], len(each['policy'])) for each in found.values()
+    }
     text = (
-        f'Each search ends at {one["asked"]:g} m or after {one["budget"]:,} cycles; mean of {len(one["policy"])} '
-        'terrains, and their range:'
+        f'Each search ends at {asked:g} m or after {budget:,} cycles; mean of {count} terrains, and their '
+        'range:'
     )
     head = 'environment', 'policy, m', 'base actions, m', 'all parameters, m'
     return f'{text}\n\n{table(head, rows)}'
@@ -192,17 +219,17 @@ def controllers(names: str) -> str:
 
 
 def styles() -> str:
-    rows = []
+    rows, every = [], []
     for name, (part, _) in STYLES.items():
         found = gallery.record('footsteps').get(controllers(part))
         if found is None:
             continue
         general, *harder = (found[k] for k in ('general', 'pushes of 150 N', 'bumps of 3 cm'))
+        every += [general, *harder]
         rows.append((
             name, f'{general["hip_above_knee"]:.2f}', pair(general, 'right_knee', 'left_knee'),
             pair(general, 'lean', 'tilt'),
-            f'{general["survived"]:.0%}', f'{general["landing"]:.3f}',
-            *(f'{each["survived"]:.0%}' for each in harder),
+            lasting(general), f'{general["landing"]:.3f}', *map(lasting, harder),
         ))  # fmt: skip
     columns = (
         'hip above knee, m',
@@ -213,7 +240,7 @@ def styles() -> str:
         'no fall, 150 N',
         'no fall, 3 cm bumps',
     )
-    return table(('style', *columns), rows)
+    return in_episodes(every, ('style', *columns), rows)
 
 
 def pair(found: dict[str, Any], *keys: str) -> str:
@@ -228,10 +255,11 @@ def compared(conditions: Iterable[str], of: dict[str, str]) -> str:
     """Returns a table of footstep controllers, by their names in the table, under conditions."""
     found = [gallery.record('footsteps')[controllers(name)] for name in of.values()]
     rows = [
-        (name, *(f'{each[name]["survived"]:.0%}, {each[name]["landing"]:.3f} m' for each in found))
+        (name, *(f'{lasting(each[name])}, {each[name]["landing"]:.3f} m' for each in found))
         for name in conditions
     ]
-    return table(('plans', *of), rows)
+    every = (each[name] for each in found for name in conditions)
+    return in_episodes(every, ('plans', *of), rows)
 
 
 def transfer() -> str:
@@ -243,10 +271,10 @@ def transfer() -> str:
             ours = [found.get(kind + under) for kind in ('reference', 'fine-tuned')]
             ours.append(found.get(f'one planner, fine-tuned with {controllers(controller)}'))
             if task in published or any(ours):
-                figures = ('–' if each is None else f'{each["reward"]:.2f}' for each in ours)
-                rows.append((f'{task}, {name}', *published.get(task, '– – –').split(), *figures))
+                theirs = published.get(task, '– – –').split()
+                rows.append((f'{task}, {name}', *theirs, *map(score, ours), counts(ours)))
     columns = (
         'unchanged', 'fine-tuned', 'retrained', 'ours, unchanged', 'ours, fine-tuned',
-        'ours, one for all',
+        'ours, one for all', 'episodes of ours',
     )  # fmt: skip
     return table(('task, controller', *columns), rows)

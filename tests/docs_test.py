@@ -145,6 +145,13 @@ class TablesTest(FolderTest):
         self.assertEqual(papers.returns([], 200), '–')
         self.assertEqual([papers.figure(value) for value in (-0.0664, 1.5)], ['-.066', '1.500'])
 
+    def test_shares_have_intervals(self):
+        half = 1.96 * (0.25 / 10 + 1.96**2 / 400) ** 0.5 / (1 + 1.96**2 / 10)  # around 0.5, of 10
+        low, high = 100 * (0.5 - half), 100 * (0.5 + half)
+        self.assertEqual(tables.share(0.5, 10), f'50% ({low:.0f} to {high:.0f})')
+        most = 100 * 1.96**2 / (10 + 1.96**2)
+        self.assertEqual(tables.share(0.0, 10), f'0% (0 to {most:.0f})')
+
     def test_tables_show_what_is_stored(self):
         """The last return of PLAiD's biped on gaps, and the changes by the stages after the first."""
         scores = [

@@ -21,10 +21,11 @@ import train_all
 from pages import DOCS, picture
 
 from trl_suite import policies
-from trl_suite.registry import catalogue, terrainrl
+from trl_suite.registry import catalogue
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
 from trl_suite.util.tables import markdown_table as table
+from trl_suite.util.tables import share
 
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
 MILESTONES = (0.5, 0.8, 0.9)  # fractions of the maximum return
@@ -45,6 +46,17 @@ def million(samples: float) -> str:
     return f'{samples / 1e6:.2g} M'
 
 
+def values(found: Iterable[dict[str, Any]], key: str = 'episodes') -> str:
+    """Returns the different values of results, such as '50 or 200'."""
+    return ' or '.join(
+        f'{value:g}' for value in sorted({each[key] for each in found if key in each})
+    )
+
+
+def complete(found: dict[str, Any]) -> str:
+    return share(found['completion_rate'], found['episodes'])
+
+
 def environment_rows(entries: dict[str, dict[str, Any]]) -> Rows:
     """Yields the results of the shipped policies; of several seeds, in other episodes than the choice."""
     for id_, entry in entries.items():
@@ -57,7 +69,7 @@ def environment_rows(entries: dict[str, dict[str, Any]]) -> Rows:
             yield [
                 f'`{id_}`', f'{found["normalized_return"]:.3f} ± {interval:.3f}',
                 f'{np.mean(scores):.3f} ({len(scores)})' if len(scores) > 1 else '–',
-                f'{found["completion_rate"]:.0%}', f'{found["distance"]:.1f}',
+                complete(found), f'{found["distance"]:.1f}',
                 million(run['curve'][-1]['samples']),
                 f'{sum(run["curve"][-1]["seconds"].values()) / 60:.0f}', str(run['seed']),
                 f'`{start}`' if start else '–',
@@ -111,7 +123,7 @@ def shared_rows() -> Rows:
             f'`{id_}`', f'`{entry["policy"]}`',
             f'{entry["preference"]:g}' if 'preference' in entry else '–',
             f'{found["distance"]:.0f} ({low:.0f} to {high:.0f})', f'{found["median_distance"]:.0f}',
-            f'{found["speed"]:.2f}', str(found['episodes']), f'{found["completion_rate"]:.0%}',
+            f'{found["speed"]:.2f}', str(found['episodes']), complete(found),
         ]  # fmt: skip
 
 
@@ -124,14 +136,18 @@ def oracle_rows() -> Rows:
     for id_, found in runs.read('oracles.json').items():
         kinds = (found.get(kind) for kind in ('base', 'random', 'nudged'))
         shares = [percent(each['prevented']) if each else '–' for each in kinds]
-        yield [f'`{id_}`', str(found['falls']), *shares, f'{found["ever_prevented"]:.0%}']
+        ever = share(found['ever_prevented'], found['falls'])
+        yield [f'`{id_}`', str(found['falls']), *shares, ever]
 
 
 def fall_rows() -> Rows:
     """Yields the shares of falls that noise prevents, by the time before the end."""
     for id_, found in runs.read('oracle_falls.json').items():
-        shares = (percent(each['prevented']) for each in found['noise'].values())
-        yield [f'`{id_}`', str(found['falls']), *shares]
+        for k, seconds in enumerate(found['seconds']):
+            shares = (
+                share(each['prevented'][k], found['falls']) for each in found['noise'].values()
+            )
+            yield [f'`{id_}`', str(found['falls']), f'{seconds:g}', *shares]
 
 
 def generalist_rows() -> Rows:
@@ -142,24 +158,23 @@ def generalist_rows() -> Rows:
         unknown, shipped = ['–'] * (len(GENERALISTS) - len(kinds)), entry['shipped']
         for id_ in entry['ids']:
             each = {kind: entry[kind][id_] for kind in kinds}
-            cells = [
-                f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each.values()
-            ]
-            share = each[shipped]['return'] / each['specialists']['return']
-            yield [f'`{id_}`', *cells, *unknown, f'{share:.2f}']
+            cells = [f'{r["normalized_return"]:.3f}, {complete(r)}' for r in each.values()]
+            part = each[shipped]['return'] / each['specialists']['return']
+            yield [f'`{id_}`', *cells, *unknown, f'{part:.2f}']
         means = {
             kind: np.mean([entry[kind][id_]['normalized_return'] for id_ in entry['ids']])
             for kind in kinds
         }
-        share = means[shipped] / means['specialists']
-        yield ['mean', *(f'{mean:.3f}' for mean in means.values()), *unknown, f'{share:.2f}']
+        part = means[shipped] / means['specialists']
+        yield ['mean', *(f'{mean:.3f}' for mean in means.values()), *unknown, f'{part:.2f}']
 
 
 def footstep_rows() -> Rows:
     for name, found in runs.read('footsteps.json').get(evaluate_footsteps.ID, {}).items():
         errors = (f'{found[key]:.3f}' for key in ('landing', 'landing_90', 'heading'))
+        lasting = share(found['survived'], found['episodes'])
         score = f'{found["normalized_return"]:.3f}'
-        yield [name, str(found['episodes']), f'{found["survived"]:.0%}', score, *errors]
+        yield [name, str(found['episodes']), lasting, score, *errors]
 
 
 def plan_rows(tag: str) -> Rows:
@@ -167,9 +182,12 @@ def plan_rows(tag: str) -> Rows:
     for id_, each in runs.read('plans.json').items():
         soccer = 'Soccer' in id_
         for name, found in each.items() if tag in catalogue.BY_ID[id_].tags else ():
+            lasting = (
+                share(found[key], found['episodes']) for key in ('survived_minute', 'survived')
+            )
             yield [
                 f'`{id_}`', name, str(found['episodes']), f'{found["reward"]:.2f}',
-                f'{found["survived_minute"]:.0%}', f'{found["survived"]:.0%}', f'{found["speed"]:.2f}',
+                *lasting, f'{found["speed"]:.2f}',
                 '–' if soccer else f'{found["goals_per_minute"]:.1f}',
                 f'{found["trail"]:.0f}' if found['trail'] else '–',
                 f'{found["at_goal"]:.0%}' if soccer else '–', f'{found["falls_per_km"]:.1f}',
@@ -182,8 +200,7 @@ def transfer_rows(entries: dict[str, dict[str, Any]]) -> Rows:
             own = train_all.shipped(entries[id_])['evaluation']
             yield [
                 f'`{id_}`', f'{own["distance"]:.1f}', f'{flat["distance"]:.1f}',
-                f'{own["distance"] / flat["distance"]:.1f}', f'{own["completion_rate"]:.0%}',
-                f'{flat["completion_rate"]:.0%}',
+                f'{own["distance"] / flat["distance"]:.1f}', complete(own), complete(flat),
             ]  # fmt: skip
 
 
@@ -195,11 +212,35 @@ PLAN_COLUMNS = (
 
 def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[str, ...], Rows]]:
     """Returns title, text, head and rows of each section; without rows it is omitted."""
+    gaits = [
+        run['evaluation']
+        for id_, entry in entries.items()
+        for run in entry['runs']
+        if catalogue.BY_ID[id_].actuation == 'gait'
+    ]
+    shared = [entry['evaluation'] for entry in runs.read(policies.SHARED).values()]
+    falls = runs.read('oracles.json').values()
+    tries = {
+        kind: values((found.get(kind, {}) for found in falls), 'actions')
+        for kind in ('base', 'random', 'nudged')
+    }
+    tracking = runs.read('oracle_falls.json').values()
+    generalists = [
+        runs.read(f'generalist/{path.name}') for path in runs.place('generalist').glob('PD_*.json')
+    ]
+    of_terrains = [found for entry in generalists for found in entry['specialists'].values()]
+    footsteps = runs.read('footsteps.json').get(evaluate_footsteps.ID, {}).values()
+    plans = [found for each in runs.read('plans.json').values() for found in each.values()]
+    flat = runs.read('transfer.json').values()
+    widths = '; '.join(
+        f'of {count}: {share(0, count)}, {share(0.5, count)}'
+        for count in sorted({found['falls'] for found in falls})
+    )
     return [
         (
             'Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of the default gait, in the same '
-            f'{train_all.GAIT_EPISODES} episodes, which are truncated after {terrainrl.STEP_LIMIT} cycles; speed in '
+            f'{values(gaits)} episodes, which are truncated after {values(gaits, "step_limit")} cycles; speed in '
             'm/s. *Cycles*: simulated in training.',
             ('environment', 'trained', 'default', 'ratio', 'mean', 'default', 'speed', 'cycles', 'seed'),
             gait_rows(entries),
@@ -208,7 +249,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'Gaits on other terrains',
             'Policies that are shipped for further environments, by `training/share_gaits.py`. *Preference*: added to '
             'the value of the default gait. *Truncated*: share of episodes that last '
-            f'{terrainrl.STEP_LIMIT} cycles; where it is high, the distance to a fall is longer.',
+            f'{values(shared, "step_limit")} cycles; where it is high, the distance to a fall is longer.',
             ('environment', 'policy of', 'preference', 'mean, 95 %', 'median', 'speed', 'episodes', 'truncated'),
             shared_rows(),
         ),
@@ -217,25 +258,28 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'By `training/oracles.py`: the share of falls that some action prevents, taken for one cycle one, two, '
             f'... five cycles before the end; the character then gets {oracles.PASSED:g} m beyond the place of '
             f'the fall, or {oracles.PASSED_CYCLES} of its mean cycles if shorter, within '
-            f'{oracles.MOST_CYCLES} cycles. *Base*: every base action (7 to 18: more tries prevent more falls); *random*: eight base actions with noise; '
-            '*nudged*: joint angles changed by 0.001 rad, eight times; *any*: at any time. Where base actions prevent '
+            f'{oracles.MOST_CYCLES} cycles. *Base*: every base action '
+            f'({tries["base"]}: more tries prevent more falls); *random*: '
+            f'{tries["random"]} base actions with noise; *nudged*: joint angles changed '
+            f'by 0.001 rad, {tries["nudged"]} times; *any*: at any time, with its 95 % '
+            f'interval (Wilson). The other shares are of as few falls ({widths}). Where base actions prevent '
             'more than nudges, the selection is the limit; else falls depend on what the policy cannot observe.',
             ('environment', 'falls', 'base', 'random', 'nudged', 'any'),
             oracle_rows(),
         ),
         (
             'Falls of tracking policies that other actions prevent',
-            'By `training/oracles.py`: the share of falls that noise in the actions prevents in any of 32 tries, '
-            'if it begins 0.25, 0.5, 1 and 1.5 s before the end; by its standard deviation in units of the '
-            'action, of which 0.001 shows what is a matter of chance. Where noise prevents a fall, neither the '
-            'clip nor the torque limits are its reason.',
-            ('environment', 'falls', '0.001', '0.15', '0.5'),
+            f'By `training/oracles.py`: the share of falls that noise in the actions prevents in any of {values(tracking, "tries")} '
+            'tries, with its 95 % interval (Wilson), if it begins some seconds before the end; by its standard '
+            'deviation in units of the action, of which 0.001 shows what is a matter of chance. Where noise '
+            'prevents a fall, neither the clip nor the torque limits are its reason.',
+            ('environment', 'falls', 'seconds', *next(iter(tracking), {'noise': ()})['noise']),
             fall_rows(),
         ),
         (
             'One policy for all terrains',
-            'By `training/generalist.py` (`--policy generalist`), 200 episodes, seed 0: return, divided by the maximum, '
-            'and share of complete episodes, of the specialists, of the policy distilled from them, of the same '
+            f'By `training/generalist.py` (`--policy generalist`), {values(of_terrains)} episodes, seed {values(of_terrains, "seed")}: return, divided by the maximum, '
+            'and share of complete episodes with its 95 % interval, of the specialists, of the policy distilled from them, of the same '
             'after PPO on all terrains, and of the mean weights of both. *Share*: that of the best one, which is '
             'shipped, divided by that of the specialist.',
             ('environment', 'specialist', 'distilled', 'after PPO', 'mean weights', 'share'),
@@ -243,7 +287,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         ),
         (
             'Footstep tracking',
-            'By `training/evaluate_footsteps.py`, episodes of 20 s, seed 0: landing error in m, mean and 90th '
+            f'By `training/evaluate_footsteps.py`, episodes of {values(footsteps, "seconds")} s, seed {values(footsteps, "seed")}: landing error in m, mean and 90th '
             'percentile, and mean heading error in rad. *General*: the plans of the environment, with sharp turns; '
             '*made from the root*: relative to the root, as in planning environments; *pushes*: forces on the '
             'torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
@@ -252,11 +296,11 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         ),
         (
             'Planning footsteps',
-            'By `training/evaluate_plans.py`: episodes of 200 s, seed 0, with the scripted and the reference policy, '
+            f'By `training/evaluate_plans.py`: episodes of 200 s, seed {values(plans, "seed")}, with the scripted and the reference policy, '
             'and the expert that was imitated. *With ID*: on another footstep controller; *fine-tuned*: trained '
             'further on it, not shipped; *one planner*: on several, see '
             '[DeepLoco](reports/deeploco.md#a-planner-on-another-controller). *Reward*: normalised, 0 after a fall. '
-            '*Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: median distance along it, m. *Ball at goal*: share of the time.',
+            '*No fall*: share of episodes, with its 95 % interval (Wilson). *Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: median distance along it, m. *Ball at goal*: share of the time.',
             PLAN_COLUMNS, plan_rows('hierarchical'),
         ),
         (
@@ -270,7 +314,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         ),
         (
             'Does training on terrain help?',
-            'Compared in the same episodes with the policy for flat ground, which has the same observation.',
+            f'Compared in the same {values(flat)} episodes with the policy for flat ground, which has the same observation.',
             ('environment', 'distance, own', 'flat policy', 'ratio', 'complete, own', 'flat policy'),
             transfer_rows(entries),
         ),
@@ -278,21 +322,21 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
 
 
 def page(entries: dict[str, dict[str, Any]]) -> str:
-    number = sum(len(entry['runs']) for entry in entries.values())
+    every = [run['evaluation'] for entry in entries.values() for run in entry['runs']]
     parts = [
         '# Results',
         f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments: '
         '`suite.reference_policy(id)`. This page is written by `training/results.py` from the '
-        f'{number} runs in `trained/`, which `training/train_all.py` repeats. The file of a run has its settings; a '
+        f'{len(every)} runs in `trained/`, which `training/train_all.py` repeats. The file of a run has its settings; a '
         '`note` says where it departed from them. Claims of the papers: [reports](reports/README.md).',
-        f'Policies are evaluated without noise, in {train_all.EPISODES} or {train_all.GAIT_EPISODES} episodes (gaits on other '
+        f'Policies are evaluated without noise, in {values(every)} episodes (gaits on other '
         'terrains: column *episodes*) that are used neither in training nor to select a policy of the curve. Where '
         'there are several seeds, the best one is shipped; its return is that in episodes that had no part in this choice, '
         'beside the mean and the number of all seeds. A later run replaces the policy if its score in these episodes '
         'is higher, so scores of environments that were trained repeatedly are slightly too high. *Return* is '
-        'divided by its maximum; the reward is 0 after a fall; intervals are too narrow where '
+        'divided by its maximum; the reward is 0 after a fall; its intervals are too narrow where '
         'falls are too rare to occur in these episodes. *Complete*: share of episodes that last to the '
-        'end (256 steps; planning environments 200 s). *Distance*: mean, m. *Minutes*: wall time of the run, one '
+        'end (256 steps; planning environments 200 s), with its 95 % interval (Wilson). *Distance*: mean, m. *Minutes*: wall time of the run, one '
         'thread of a shared machine. *Initial policy*: where training starts, its samples '
         'not included; or what is imitated first, samples included: `scripted`, the hand-written policy; `expert` and '
         '`joint_expert`, [experts with a map](../training/expert.py) for footsteps and for joint targets; `nominal`, '

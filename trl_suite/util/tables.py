@@ -74,6 +74,14 @@ def markdown_table(header: Iterable[str], cells: Iterable[Iterable[object]]) -> 
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
+def share(value: float, count: int) -> str:
+    """Returns a share of independent cases in percent, and its 95 % confidence interval (Wilson)."""
+    from scipy import stats  # takes time, and few programs need it
+
+    low, high = stats.binomtest(round(value * count), count).proportion_ci(method='wilson')
+    return f'{value:.0%} ({100 * low:.0f} to {100 * high:.0f})'
+
+
 def _escaped(table: Table) -> str:
     header, rows = list(table.header), [[escape(_cell(c)) for c in row] for row in table.cells]
     if table.numbered:
