@@ -41,11 +41,10 @@ def main() -> None:
             row[name] = round(result['normalized_return'], 4)
             half = result['return_interval'] / result['step_limit']
             print(f'{id} {name} {row[name]} +- {half:.4f}', flush=True)
-        # Read again: another process may have written other rows.
-        found = files.read_json(core.SCALES)['scores'] if core.SCALES.exists() else {}
-        found[id] = row
-        order = {id: found[id] for id in core.CORE if id in found}
-        files.write_json({'format': core.BENCHMARK.format, 'scores': order}, core.SCALES)
+        with files.changing(core.SCALES) as found:  # other processes may write other rows
+            scores = {**found.get('scores', {}), id: row}
+            order = {id: scores[id] for id in core.CORE if id in scores}
+            found |= {'format': core.BENCHMARK.format, 'scores': order}
 
 
 if __name__ == '__main__':

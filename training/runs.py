@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import hashlib
 import io
-import json
 import pathlib
 import platform
 import re
@@ -31,6 +30,8 @@ from trl_suite.util.options import checked
 
 WRITTEN = 'checkpoint.pt', 'curve.json', 'policy.npz', 'first', '.lock'  # in the folder of a run
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
+# Of files with results: one line, since they have long lists; settings may be infinite.
+FORM: dict[str, Any] = {'indent': None, 'allow_nan': True}
 FORMAT = b'trl_suite checkpoint 1\n'
 LARGEST = 2**32  # bytes
 # Globals in pickled arrays; `bytes` in empty ones.
@@ -88,8 +89,7 @@ def write_curve(
         'id': id_, 'seed': seed, **more, 'settings': dataclasses.asdict(settings),
         'threads': threads, 'curve': curve,
     }  # fmt: skip
-    # Settings may be infinite, which `write_json` refuses.
-    files.write_text(json.dumps(record, indent=1), folder / 'curve.json')
+    files.write_json(record, folder / 'curve.json', allow_nan=True)  # settings may be infinite
 
 
 def save(state: dict[str, Any], path: pathlib.Path) -> None:
@@ -212,18 +212,25 @@ def read(name: str) -> dict[str, Any]:
 
 
 def write(name: str, content: Any) -> None:
-    """Writes a .json file with results in one line, since they have long lists."""
+    """Writes a .json file with results."""
     place(name).parent.mkdir(parents=True, exist_ok=True)
-    files.write_text(json.dumps(content) + '\n', place(name))
+    files.write_json(content, place(name), **FORM)
+
+
+def changing(name: str) -> contextlib.AbstractContextManager[dict[str, Any]]:
+    """Yields the content of a .json file with results, to be changed; see `files.changing`."""
+    return files.changing(place(name), **FORM)
 
 
 def add(name: str, id_: str, key: str, value: Any) -> None:
-    """Adds a result of an environment to a .json file, as it is now: other processes may write it, too."""
-    content = read(name)
-    content.setdefault(id_, {})[key] = value
-    write(name, content)
+    """Adds a result of an environment to a .json file."""
+    with changing(name) as content:
+        content.setdefault(id_, {})[key] = value
 
 
 def enter(name: str, key: str, value: Any) -> None:
-    """Enters a result into a .json file."""
-    write(name, dict(sorted({**read(name), key: value}.items())))
+    """Enters a result into a .json file, whose keys are sorted."""
+    with changing(name) as content:
+        found = sorted({**content, key: value}.items())
+        content.clear()
+        content.update(found)

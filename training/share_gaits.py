@@ -99,7 +99,8 @@ def main() -> None:
             continue
         entry = {'policy': of, **({'preference': preference} if preference else {})}
         runs.enter(policies.SHARED, id_, {**entry, 'evaluation': found})
-        remove_unused(runs.read(policies.SHARED))
+        with runs.changing(policies.SHARED) as shared:  # no other process changes it meanwhile
+            remove_unused(shared)
 
 
 if __name__ == '__main__':

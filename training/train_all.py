@@ -278,10 +278,9 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
             id_, policies.load(runs.place(f'{id_}.npz')), EPISODES, OTHER_SEED, num_threads=1
         )
     runs.write(f'{id_}.json', entry)
-    used = runs.read(policies.SHARED)
-    if id_ in used and used[id_]['evaluation'][score] < best['evaluation'][score]:
-        del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
-        runs.write(policies.SHARED, used)
+    with runs.changing(policies.SHARED) as used:
+        if id_ in used and used[id_]['evaluation'][score] < best['evaluation'][score]:
+            del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
 
 
 def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callable[[str, int], Run]:

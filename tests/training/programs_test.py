@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import pathlib
+import subprocess
 import sys
 from types import SimpleNamespace
 from unittest import mock
@@ -79,7 +80,9 @@ class CompareTest(FolderTest):
         last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
         first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
         points = enumerate((first, last), start=1)
-        return [{'control_steps': control_steps * i / 2, **each} for i, each in points]
+        return [
+            {'control_steps': control_steps * i / 2, 'episodes': 8, **each} for i, each in points
+        ]
 
     def test_finished_runs_are_kept_and_shown(self):
         first, out = self.run_program('actions', self.action)
@@ -87,7 +90,7 @@ class CompareTest(FolderTest):
         self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
         second, out = self.run_program('actions', self.action, '--seeds', '1', '2')
         self.assertEqual(second, [(action, 2) for action, _ in first])
-        self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
+        self.assertIn('| one of the base actions | 108 | 208 | 158 ± 635 | 3.0 |', out)
         self.assertIn('in `FSM_Dog2D_Terrain_Mixed-v0`', out)
         message = 'samples is 32768.*, not 100.*; give another --json'
         with self.assertRaisesRegex(ValueError, message):
@@ -96,8 +99,11 @@ class CompareTest(FolderTest):
     def test_tables(self):
         trained, out = self.run_program('hierarchy', self.hierarchy, '--seeds', '1', '2')
         self.assertLen(trained, 8)
-        self.assertIn('along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out)
-        self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
+        self.assertIn('along the trail in 200 s, m | 11.0 | 21.0 | 16.0 ± 63.5 | 50% 50% |', out)
+        self.assertIn(
+            'time with the ball at its goal, % | 25.0 | 50.0 | 37.5 ± 158.8 | 50% 50% |', out
+        )
+        self.assertIn('8 episodes of 200 s', out)
         (self.folder / 'found.json').unlink()
 
         def limited(cell, seed, samples):
@@ -672,6 +678,35 @@ class TrimTest(FolderTest):
 
 
 class ProgramsTest(FolderTest):
+    def test_no_process_erases_what_another_has_added(self):
+        path = self.folder / 'new' / 'found.json'
+        program = 'import sys, pathlib\nfrom trl_suite.util import files\nfor i in range(100):\n'
+        program += ' with files.changing(pathlib.Path(sys.argv[1]), {"episodes": 8}) as found:\n'
+        program += '  found.setdefault(sys.argv[2], []).append(i)\n'
+        running = [
+            subprocess.Popen([sys.executable, '-c', program, path, name]) for name in ('a', 'b')
+        ]
+        self.assertEqual([each.wait() for each in running], [0, 0])
+        every = list(range(100))
+        self.assertEqual(files.read_json(path), {'episodes': 8, 'a': every, 'b': every})
+        for start, error in (
+            ({'episodes': 9}, 'episodes is 8, not 9'),
+            ({'limit': 3}, 'limit is None, not 3'),
+        ):
+            with (
+                self.assertRaisesRegex(ValueError, f'other settings: {error}; give another file'),
+                files.changing(path, start),
+            ):
+                pass
+        written = path.stat().st_mtime_ns
+        with contextlib.suppress(KeyError), files.changing(path) as found:
+            found['a'] = found['b'] = 0
+            raise KeyError
+        with files.changing(path) as found:
+            self.assertEqual(found['a'], every)
+        self.assertEqual(path.stat().st_mtime_ns, written)  # nothing was changed
+        self.assertEqual(os.listdir(path.parent), ['found.json'])
+
     def test_only_folders_of_runs_are_removed(self):
         (self.folder / 'thesis.txt').write_text('mine')
         with self.assertRaisesRegex(FileExistsError, 'is not the folder of a run'):

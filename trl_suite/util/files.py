@@ -11,7 +11,7 @@ import pathlib
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TextIO
 
 from trl_suite.util import errors
@@ -208,7 +208,7 @@ def replace_between(path: pathlib.Path, name: str, program: str, text: str) -> N
 
 
 @contextlib.contextmanager
-def locked(path: pathlib.Path, what: str) -> Iterator[None]:
+def locked(path: pathlib.Path, what: str, wait: bool = False) -> Iterator[None]:
     """Holds a lock file that names this process; a process that ends in any way releases it.
 
     Nothing is locked on systems without `fcntl`, such as Windows, and on file systems without locks.
@@ -216,9 +216,10 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
     Args:
       path: the lock file; removed at the end.
       what: what another process that has the lock does, for the message.
+      wait: whether to wait for that process.
 
     Raises:
-      RuntimeError: another process has the lock; the message has its number.
+      RuntimeError: another process has the lock; the message has its number. Not with `wait`.
       OSError: the file cannot be written, or is a link, or no lock file.
     """
     if fcntl is None:
@@ -227,7 +228,7 @@ def locked(path: pathlib.Path, what: str) -> Iterator[None]:
     while True:
         with _opened_lock(path) as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             except BlockingIOError:
                 raise RuntimeError(f'process {file.read().strip() or "?"} {what}') from None
             except OSError:
@@ -261,6 +262,45 @@ def _opened_lock(path: pathlib.Path) -> TextIO:
     return os.fdopen(number, 'r+', encoding='utf-8', errors='replace')
 
 
-def write_json(content: Any, path: pathlib.Path, indent: int | None = 1) -> None:
+def write_json(
+    content: Any, path: pathlib.Path, indent: int | None = 1, allow_nan: bool = False
+) -> None:
     """Writes a .json file, in one line if `indent` is None."""
-    write_text(json.dumps(content, indent=indent, allow_nan=False) + '\n', path)
+    write_text(json.dumps(content, indent=indent, allow_nan=allow_nan) + '\n', path)
+
+
+@contextlib.contextmanager
+def changing(
+    path: pathlib.Path, start: Mapping[str, Any] | None = None, **how: Any
+) -> Iterator[dict[str, Any]]:
+    """Yields the content of a .json file, to be changed, and writes it if it was.
+
+    Other processes that change the file in this way wait meanwhile, so that none erases what another
+    has added.
+
+    Args:
+      path: the file; its folder is made.
+      start: content of a new file. An existing one must have the same settings, which are all values
+        but lists and objects.
+      **how: options of `write_json`.
+
+    Raises:
+      ValueError: the file has other settings.
+    """
+    content = json.loads(json.dumps(start or {}))
+    settings = {
+        name: value for name, value in content.items() if not isinstance(value, (dict, list))
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(path.with_name(f'.{path.name}.lock'), 'changes it', wait=True):
+        before = '{}'
+        if path.exists():
+            content = read_json(path)
+            before = json.dumps(content)
+        for name, value in settings.items():
+            if content.get(name) != value:
+                other = f'{name} is {content.get(name)!r}, not {value!r}'
+                raise ValueError(f'{path} has other settings: {other}; give another file')
+        yield content
+        if json.dumps(content) != before:
+            write_json(content, path, **how)
