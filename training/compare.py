@@ -136,11 +136,13 @@ def distance_table(names: dict[str, str], id_: str, results: Results, seeds: lis
     for cell, name in names.items():
         if done := of(results, cell):
             distances = [f'{done[seed]["distance"]:.0f}' if seed in done else '–' for seed in seeds]
-            mean, speed = (
-                np.mean([each[k] for each in done.values()]) for k in ('distance', 'speed')
-            )
-            rows.append([name, *distances, f'{mean:.0f}', f'{speed:.1f}'])
-    title = f'Distance to the first fall in `{id_}`, mean of {ACTION_EPISODES} episodes, m:'
+            mean = pages.interval((each['distance'] for each in done.values()), 0)
+            speed = np.mean([each['speed'] for each in done.values()])
+            rows.append([name, *distances, mean, f'{speed:.1f}'])
+    title = (
+        f'Distance to the first fall in `{id_}`, mean of {ACTION_EPISODES} episodes, m, and mean of the seeds with '
+        "its 95 % interval (Student's t):"
+    )
     head = ['action', *(f'seed {seed}' for seed in seeds), 'mean', 'speed, m/s']
     return f'{title}\n\n{tables.markdown_table(head, rows)}'
 
@@ -204,17 +206,19 @@ def train_hierarchy(
 
 
 def hierarchy_table(results: Results, seeds: list[int]) -> str:
+    [episodes] = {run[-1]['episodes'] for run in results.values()}
     rows = []
     for task, (*_, name, factor, label) in TASKS.items():
         for kind in KINDS:
             done = {seed: run[-1] for seed, run in of(results, f'{task}/{kind}').items()}
             if done:
                 cells = [f'{factor * done[s][name]:.1f}' if s in done else '–' for s in seeds]
-                mean = factor * np.mean([last[name] for last in done.values()])
-                minute = np.mean([last['survived_minute'] for last in done.values()])
-                rows.append([f'{task}, {kind}: {label}', *cells, f'{mean:.1f}', f'{minute:.0%}'])
+                mean = pages.interval((factor * last[name] for last in done.values()), 1)
+                minute = ' '.join(f'{done[s]["survived_minute"]:.0%}' for s in seeds if s in done)
+                rows.append([f'{task}, {kind}: {label}', *cells, mean, minute])
     head = ['task', *(f'seed {seed}' for seed in seeds), 'mean', 'no fall in a minute']
-    return f'{HIERARCHY_EPISODES} episodes of 200 s:\n\n{tables.markdown_table(head, rows)}'
+    title = f"{episodes} episodes of 200 s; mean of the seeds with its 95 % interval (Student's t):"
+    return f'{title}\n\n{tables.markdown_table(head, rows)}'
 
 
 def hierarchy_panels(results: Results) -> dict[str, dict[str, list[Any]]]:

@@ -12,12 +12,11 @@ from __future__ import annotations
 import argparse
 import pathlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pages import DOCS, picture
-from scipy import special
+from pages import DOCS, interval, picture
 
 from trl_suite import sequences
 from trl_suite.util import files
@@ -33,15 +32,6 @@ COLUMNS = (
 )  # fmt: skip
 Result = dict[str, Any]
 Runs = dict[str, dict[int, Result]]  # learner -> seed -> result
-
-
-def interval(values: Iterable[float]) -> str:
-    """Returns mean and half width of the 95 % confidence interval of the mean (Student's t)."""
-    found = np.fromiter(values, float)
-    if len(found) < 2:
-        return ' '.join(f'{value:.3f}' for value in found) or '–'
-    half = special.stdtrit(len(found) - 1, 0.975) * found.std(ddof=1) / np.sqrt(len(found))
-    return f'{found.mean():.3f} ± {half:.3f}'
 
 
 def load(folder: pathlib.Path) -> Runs:

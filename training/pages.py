@@ -1,17 +1,27 @@
-"""Pictures of results for the pages of the documentation."""
+"""Pictures and intervals of results for the pages of the documentation."""
 
 from __future__ import annotations
 
 import contextlib
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from trl_suite.util import files
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
+
+
+def interval(values: Iterable[float], digits: int = 3) -> str:
+    """Returns mean and half width of the 95 % confidence interval of the mean (Student's t)."""
+    found = np.fromiter(values, float)
+    if len(found) < 2:
+        return ' '.join(f'{value:.{digits}f}' for value in found) or '–'
+    half = special.stdtrit(len(found) - 1, 0.975) * found.std(ddof=1) / np.sqrt(len(found))
+    return f'{found.mean():.{digits}f} ± {half:.{digits}f}'
 
 
 @contextlib.contextmanager
