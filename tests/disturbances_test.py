@@ -632,7 +632,13 @@ class ProgramsTest(FolderTest):
             robustness.run(ids[:1], 2, [0], 1, 40, path)
         self.assertLen(again.mock_calls, 2)
         share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
-        self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
+        self.assertRegex(robustness.table(found), rf'\| push \| 9 m/s \| {share}±\d+ \|')
+        row = {
+            name: {'return': value, 'return_interval': half}
+            for name, value, half in (('none', 100, 6), ('a', 50, 4), ('b', 90, 4))
+        }
+        shares = [robustness.share({'seeds': {'0': {'x': row}}}, 'x', key) for key in 'ab']
+        self.assertEqual(shares, ['50±5', '90'])  # 4 and 50 % of 6 are independent
 
     def test_the_measurements_are_of_the_shipped_policies(self):
         if not policies.available('randomized'):
