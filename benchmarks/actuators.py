@@ -68,11 +68,12 @@ def fits(id_: str, options: dict[str, object]) -> bool:
     return True
 
 
-def store(name: str, result: object) -> None:
-    """Stores results under a name, beside the others."""
-    found = files.read_json(RESULTS) if RESULTS.exists() else {}
-    found[name] = result
-    files.write_json(found, RESULTS)
+def store(name: str, title: str, row: object, **settings: object) -> None:
+    """Stores a row of a table; its other rows are removed if they have other settings."""
+    with files.changing(RESULTS) as found:
+        others = found.get(name, {})
+        same = settings.items() <= others.items()
+        found[name] = {**(others if same else settings), title: row}
 
 
 # Costs.
@@ -91,7 +92,6 @@ def cpu(environments: VectorEnvironment, steps: int) -> float:
 
 def costs(titles: list[str]) -> None:
     """Measures the time of each option relative to ideal actuators."""
-    result = files.read_json(RESULTS).get('costs', {}) if RESULTS.exists() else {}
     errors.check_known('title', COST_IDS, *titles)
     for title in titles or COST_IDS:
         id_ = COST_IDS[title]
@@ -108,10 +108,10 @@ def costs(titles: list[str]) -> None:
             for name, environments in made.items():
                 times[name].append(cpu(environments, 1 if 'gait' in title else STEPS))
         median = {name: float(np.median(each[1:])) for name, each in times.items()}
-        result[title] = {name: value / median['ideal'] for name, value in median.items()}
-        result[title]['ideal'] = median['ideal']
-        print(title, result[title], flush=True)
-        store('costs', result)
+        row = {name: value / median['ideal'] for name, value in median.items()}
+        row['ideal'] = median['ideal']
+        print(title, row, flush=True)
+        store('costs', title, row)
 
 
 # Effects on shipped policies.
@@ -119,15 +119,10 @@ def costs(titles: list[str]) -> None:
 
 def effects(episodes: int) -> None:
     """Evaluates shipped policies with each option at three strengths."""
-    stored = files.read_json(RESULTS).get('effects', {}) if RESULTS.exists() else {}
-    if stored.get('episodes') != episodes:
-        stored = {}
-    result: dict[str, object] = {**stored, 'episodes': episodes}
     for title, id_ in EFFECT_IDS.items():
         policy = policies.reference(id_)
         ideal = evaluation.evaluate(id_, policy, episodes)['return']
         row: dict[str, object] = {'ideal': ideal}
-        result[title] = row
         for name, strengths in STRENGTHS.items():
             shares = []
             for each in strengths:
@@ -140,7 +135,7 @@ def effects(episodes: int) -> None:
                 shares.append(found['return'] / ideal)
             row[name] = shares
             print(title, name, shares, flush=True)
-            store('effects', result)
+        store('effects', title, row, episodes=episodes)
 
 
 # Plots: each panel shows a formula as a line, and what a simulation did as dots.

@@ -254,16 +254,14 @@ def cells() -> list[tuple[str, str]]:
 
 def run(episodes: int, seed: int, path: pathlib.Path) -> dict[str, Any]:
     """Measures what the file does not have yet; returns all, by environment and change."""
-    found: dict[str, Any] = {'episodes': episodes, 'seed': seed, 'results': {}}
-    if path.exists():
-        found = files.read_json(path)
-        if (found['episodes'], found['seed']) != (episodes, seed):
-            raise ValueError(f'{path} has other episodes or another seed; give another --json')
+    start = {'episodes': episodes, 'seed': seed, 'results': {}}
+    with files.changing(path, start) as found:
+        pass  # what there is
     for id_, name in tqdm.tqdm(cells()):
-        row = found['results'].setdefault(id_, {})
-        if name not in row:
-            row[name] = measure(id_, name, episodes, seed)
-            files.write_json(found, path)
+        if name not in found['results'].get(id_, {}):
+            result = measure(id_, name, episodes, seed)
+            with files.changing(path, start) as found:
+                found['results'].setdefault(id_, {})[name] = result
     return found
 
 

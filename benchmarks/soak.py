@@ -33,6 +33,7 @@ from trl_suite.util import files, program
 from trl_suite.vector import VectorEnvironment
 
 FILE = pathlib.Path(__file__).resolve().parents[1] / 'docs' / 'data' / 'soak.json'
+NEW = {'task_types': {}, 'not_finite': [], 'runs': []}  # figures
 KINDS = ('uniform', 'changing', 'held', 'huge')
 SPECS = (
     *(suite.find(id_) for id_ in suite.ALL_IDS),
@@ -117,12 +118,6 @@ def merged(total, found):
     return {**{name: total[name] + found[name] for name in found}, 'largest': most}
 
 
-def load(path):
-    if not path.exists():
-        return {'task_types': {}, 'not_finite': [], 'runs': []}
-    return files.read_json(path)
-
-
 def show(figures):
     names = [name for name in TASK_TYPES if name in figures['task_types']]
     for name in names:
@@ -155,35 +150,40 @@ def main():
     parser.add_argument('--file', type=pathlib.Path, default=FILE, help='accumulated figures')
     parser.add_argument('--show', action='store_true', help='print the figures, and run nothing')
     arguments = parser.parse_args()
-    figures = load(files.check_path(arguments.file, ('.json',)))
+    path = files.check_path(arguments.file, ('.json',))
     if arguments.show:
-        show(figures)
+        show(files.read_json(path) if path.exists() else NEW)
         return
-    used = [run['seed'] for run in figures['runs']]
-    seed = max(used, default=-1) + 1 if arguments.seed is None else arguments.seed
-    random, begin = np.random.default_rng(seed), time.time()
+    begin = time.time()
     run = {
-        'seed': seed, 'date': time.strftime('%Y-%m-%d', time.gmtime(begin)), 'seconds': 0.0,
+        'seed': arguments.seed, 'date': time.strftime('%Y-%m-%d', time.gmtime(begin)), 'seconds': 0.0,
         'environments': 0, 'num_envs': arguments.num_envs, 'threads': arguments.threads,
         'versions': {name: importlib.metadata.version(name) for name in ('trl_suite', 'mujoco')},
         'memory': [],  # environments closed, control steps, and MB
     }  # fmt: skip
-    figures['runs'].append(run)
+    with files.changing(path, NEW, indent=None) as figures:  # no other run gets the seed
+        place = len(figures['runs'])
+        if arguments.seed is None:
+            run['seed'] = max((each['seed'] for each in figures['runs']), default=-1) + 1
+        figures['runs'].append(run)
+    seed = run['seed']
+    random = np.random.default_rng(seed)
     steps, bar = 0, tqdm(total=round(arguments.seconds), unit='s', mininterval=10)
     for i in order(random):
         spec, own = SPECS[i], int(random.integers(2**32))
         found = soak(spec, arguments.each, arguments.num_envs, arguments.threads, own)
-        if found['not_finite']:
-            figures['not_finite'].append({'id': spec.id, 'seed': own, 'run': seed, **found})
-        types = figures['task_types']
-        types[spec.task_type] = merged(types.get(spec.task_type), found)
         steps += found['control_steps']
         run['seconds'], run['environments'] = (
             round(time.time() - begin, 1),
             run['environments'] + 1,
         )
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
-        files.write_json(figures, arguments.file, indent=None)
+        with files.changing(path, NEW, indent=None) as figures:
+            if found['not_finite']:
+                figures['not_finite'].append({'id': spec.id, 'seed': own, 'run': seed, **found})
+            types = figures['task_types']
+            types[spec.task_type] = merged(types.get(spec.task_type), found)
+            figures['runs'][place] = run
         bar.set_postfix_str(f'{steps / 1e6:.2f} M control steps, {run["memory"][-1][2]} MB')
         bar.update(min(round(run['seconds']), bar.total) - bar.n)
         if time.time() >= begin + arguments.seconds:

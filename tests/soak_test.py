@@ -69,11 +69,13 @@ class SoakTest(FolderTest):
         self.assertEqual(found['control_steps'], round(600 * np.sum(durations)))
         self.assertGreater(found['control_steps'], 100)
 
-    def run_soak(self, *arguments, **figures):
+    def run_soak(self, *arguments, meanwhile=None, **figures):
         seen, path = [], self.folder / 'a.json'
 
         def run(spec, seconds, num_envs, threads, seed):
             seen.append((spec.id, seed))
+            if meanwhile is not None:
+                meanwhile()
             return {**FIGURES, **figures}
 
         with mock.patch.object(soak, 'soak', run):
@@ -93,6 +95,11 @@ class SoakTest(FolderTest):
         self.assertIn('all: 200 control steps', out)
         self.assertIn('all: 20 steps', out)
         self.assertIn(f"NOT FINITE: {{'id': '{second[0][0]}'", out)
+        # Another one during the next run, with a seed of its own.
+        _, figures, _ = self.run_soak(meanwhile=self.run_soak)
+        self.assertEqual([run['seed'] for run in figures['runs']], [0, 1, 2, 3])
+        self.assertEqual([run['environments'] for run in figures['runs']], [1] * 4)
+        self.assertEqual(sum(each['steps'] for each in figures['task_types'].values()), 40)
         # A run with the same seed does the same.
         (self.folder / 'a.json').unlink()
         self.assertEqual(self.run_soak('--seed', '1')[0], second)

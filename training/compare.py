@@ -340,20 +340,16 @@ def main() -> None:
     checked('--samples', samples, float, above=0)
     checked('--seeds', arguments.seeds, list[int], at_least=0)
     path = arguments.json or arguments.runs / f'{name}.json'
-    found: dict[str, Any] = {'samples': samples, 'results': {}}
-    if path.exists():
-        found = files.read_json(path)
-        if found['samples'] != samples:
-            raise ValueError(
-                f'{path}: samples is {found["samples"]}, not {samples}; give another --json'
-            )
+    start: dict[str, Any] = {'samples': samples, 'results': {}}
+    with files.changing(path, start) as found:
+        pass  # what there is
     jobs = [(cell, seed) for seed in arguments.seeds for cell in compared.cells]
     for cell, seed in tqdm.tqdm(jobs, unit='run'):
         if f'{cell}/{seed}' not in found['results']:
             folder = arguments.runs / f'{name}_{samples:g}' / cell / f'seed_{seed}'
-            found['results'][f'{cell}/{seed}'] = compared.job(cell, seed, samples, folder)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            files.write_json(found, path)
+            result = compared.job(cell, seed, samples, folder)
+            with files.changing(path, start) as found:
+                found['results'][f'{cell}/{seed}'] = result
     print(text := described(compared, found))
     if arguments.picture is not None:
         pages.curves(arguments.picture, compared.panels(found['results']), compared.axis)

@@ -50,14 +50,16 @@ def main():
     parser.add_argument('--output', type=pathlib.Path, required=True, help='folder of the runs')
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    found = files.read_json(FILE) if FILE.exists() else {}
+    found = files.read_json(FILE) if FILE.exists() else {}  # scores of the seeds 0, 1, ...
     for seed in benchmark.SEEDS:
         for id_ in IDS:
             for count in COUNTS:
-                scores = found.setdefault(id_, {}).setdefault(str(count), [])
-                if len(scores) == seed:
-                    scores.append(measured(id_, count, seed, arguments.output))
-                    files.write_json(found, FILE)
+                if len(found.get(id_, {}).get(str(count), [])) == seed:
+                    result = measured(id_, count, seed, arguments.output)
+                    with files.changing(FILE) as found:
+                        scores = found.setdefault(id_, {}).setdefault(str(count), [])
+                        if len(scores) == seed:  # else another process has measured it, too
+                            scores.append(result)
 
 
 if __name__ == '__main__':

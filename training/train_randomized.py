@@ -61,17 +61,22 @@ def measure(id_: str) -> dict[str, Any]:
     """Evaluates where results of the present policies are missing; returns all of an environment."""
     entry = runs.read(place(id_))
     for name, variant in (('evaluations', 'randomized'), ('before', '')):
-        policy, found = policies.reference(id_, variant), entry.setdefault(name, {})
-        of = entry.setdefault('of', {})
-        if of.get(name) != digest(policy):
-            found.clear()
-            of[name] = digest(policy)
+        policy = policies.reference(id_, variant)
         for condition, options in CONDITIONS.items():
-            if condition not in found:
+            if condition not in results_of(entry, name, digest(policy)):
                 result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
-                found[condition] = {key: result[key] for key in RESULTS}
-                runs.write(place(id_), entry)
+                with runs.changing(place(id_)) as entry:
+                    found = results_of(entry, name, digest(policy))
+                    found[condition] = {key: result[key] for key in RESULTS}
     return entry
+
+
+def results_of(entry: dict[str, Any], name: str, policy: str) -> dict[str, Any]:
+    """Returns the results of a policy, by its digest; those of another one are removed."""
+    of = entry.setdefault('of', {})
+    if of.get(name) != policy:
+        of[name], entry[name] = policy, {}
+    return entry.setdefault(name, {})
 
 
 def preset(entry: dict[str, Any]) -> str:

@@ -466,10 +466,10 @@ def main() -> None:
             print(enter_default(gait.character, chosen, record))
             return
         kind = 'steady' if action == 'steady' else terrain
-        name = f'{kind}_{1 + sum(each.rsplit("_", 1)[0] == kind for each in found)}'
-        found[name] = {'vector': chosen.tolist(), 'tuning': record}
+        with files.changing(path) as found:
+            name = f'{kind}_{1 + sum(each.rsplit("_", 1)[0] == kind for each in found)}'
+            found[name] = {'vector': chosen.tolist(), 'tuning': record}
         print(name, record, flush=True)
-        files.write_json(found, path)
 
 
 if __name__ == '__main__':

@@ -17,6 +17,7 @@ import evaluate_footsteps
 import evaluate_plans
 import evaluate_references
 import expert
+import generalisation
 import generalist
 import learn_gaits
 import networks
@@ -92,7 +93,7 @@ class CompareTest(FolderTest):
         self.assertEqual(second, [(action, 2) for action, _ in first])
         self.assertIn('| one of the base actions | 108 | 208 | 158 ± 635 | 3.0 |', out)
         self.assertIn('in `FSM_Dog2D_Terrain_Mixed-v0`', out)
-        message = 'samples is 32768.*, not 100.*; give another --json'
+        message = 'samples is 32768.*, not 100.*; give another file'
         with self.assertRaisesRegex(ValueError, message):
             self.run_program('actions', self.action, '--samples', '100')
 
@@ -678,6 +679,42 @@ class TrimTest(FolderTest):
 
 
 class ProgramsTest(FolderTest):
+    def test_results_that_another_process_adds_during_a_measurement_are_kept(self):
+        path, id_ = self.folder / 'found.json', 'PD_Biped2D_Gaps_Terrain-v0'
+        own = {'distance': 9.0, 'speed': 3.0, 'curve': [[8, 5.0]]}
+        compared = compare.COMPARISONS['actions']._replace(cells=('both',))
+        result = dict.fromkeys(train_randomized.RESULTS, 1.0)
+        levels = {'FILE': path, 'IDS': (id_,), 'COUNTS': (10,)}
+        self.enterContext(mock.patch.object(runs, 'place', lambda _: path))
+        self.enterContext(mock.patch.object(policies, 'reference', lambda id_, *_: id_))
+        for program, found, (table, row) in (
+            (lambda: output(compare.main, 'actions', '--json', path), own, ('results', 'both/1')),
+            (lambda: output(generalisation.main, '--output', self.folder), [0.5, 0.4], (id_, '10')),
+            (lambda: train_randomized.measure(id_), result, ('before', 'harsh')),
+        ):
+            asked = []
+
+            def measure(*arguments, found=found, asked=asked):
+                asked.append(arguments)
+                with files.changing(path) as content:
+                    content.setdefault('another', []).append(len(asked))
+                return found
+
+            job = compared._replace(job=measure)
+            with (
+                self.subTest(table),
+                mock.patch.dict(compare.COMPARISONS, {'actions': job}),
+                mock.patch.multiple(generalisation, measured=measure, **levels),
+                mock.patch.object(evaluation, 'evaluate', measure),
+            ):
+                program()
+                content = files.read_json(path)
+                self.assertEqual(content['another'], [*range(1, len(asked) + 1)])
+                self.assertIn(content[table][row], (found, [found] * len(asked)))
+                program()  # nothing is left
+                self.assertEqual(files.read_json(path), content)
+            path.unlink()
+
     def test_no_process_erases_what_another_has_added(self):
         path = self.folder / 'new' / 'found.json'
         program = 'import sys, pathlib\nfrom trl_suite.util import files\nfor i in range(100):\n'
