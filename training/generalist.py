@@ -35,6 +35,7 @@ from several import Several
 from train_all import SEED
 
 from trl_suite import evaluation, policies
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -144,10 +145,10 @@ def enter(ids: list[str], policy: policies.Policy, entry: dict[str, Any]) -> Non
     path = runs.place(f'generalist/{policy.id}.npz')
     path.parent.mkdir(parents=True, exist_ok=True)
     policies.save(policy, path)
+    runs.write(f'generalist/{policy.id}.json', {**entry, 'of': digest(policy)})
     for id_ in ids:
         if id_ != policy.id:
             runs.enter(f'generalist/{policies.SHARED}', id_, {'policy': policy.id})
-    runs.write(f'generalist/{policy.id}.json', entry)
 
 
 def main() -> None:

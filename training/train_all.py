@@ -49,6 +49,7 @@ from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.task_type import TASK_TYPES
 from trl_suite.util import errors, files
+from trl_suite.util.digest import digest
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
@@ -256,28 +257,32 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
     affected by the choice, but the evaluation of the chosen one is, so it is evaluated once more in
     episodes that had no part in it.
     """
-    own, score, before = run.entry, TASK_TYPES[catalogue.BY_ID[id_].task_type].score, entries(id_)
-    others = [r for r in before if r['settings'] == own['settings']]
-    found = own['evaluation'][score]
-    most = max((r['evaluation'][score] for r in before), default=found)
-    if not (others or overwrite) and most > found:
-        print(
-            f'{id_}: not entered, since {score} is {found:.3f}, and {most:.3f} with the shipped policy'
-        )
-        return
-    every = sorted([own, *(r for r in others if r['seed'] != seed)], key=lambda r: r['seed'])
-    best = max(every, key=lambda r: r['evaluation'][score])
-    if best is not own and runs.read(f'{id_}.json').get('shipped') == seed:
-        every, best = [own], own  # the policy that is replaced is the only one that is stored
-    if best is own:
-        runs.place('').mkdir(parents=True, exist_ok=True)
-        policies.save(run.policy, runs.place(f'{id_}.npz'))
-    entry = {'id': id_, 'shipped': best['seed'], 'runs': every}
-    if len(every) > 1:
-        entry['shipped_again'] = evaluation.evaluate(
-            id_, policies.load(runs.place(f'{id_}.npz')), EPISODES, OTHER_SEED, num_threads=1
-        )
-    runs.write(f'{id_}.json', entry)
+    own, score = run.entry, TASK_TYPES[catalogue.BY_ID[id_].task_type].score
+    path = runs.place(f'{id_}.npz')
+    with runs.changing(f'{id_}.json') as stored:
+        before = entries(id_)
+        others = [r for r in before if r['settings'] == own['settings']]
+        found = own['evaluation'][score]
+        most = max((r['evaluation'][score] for r in before), default=found)
+        if not (others or overwrite) and most > found:
+            print(
+                f'{id_}: not entered, since {score} is {found:.3f}, and {most:.3f} with the shipped policy'
+            )
+            return
+        every = sorted([own, *(r for r in others if r['seed'] != seed)], key=lambda r: r['seed'])
+        best = max(every, key=lambda r: r['evaluation'][score])
+        if best is not own and stored.get('shipped') == seed:
+            every, best = [own], own  # the policy that is replaced is the only one that is stored
+        policy = run.policy if best is own else policies.load(path)
+        entry = {'id': id_, 'shipped': best['seed'], 'of': digest(policy), 'runs': every}
+        if len(every) > 1:
+            entry['shipped_again'] = evaluation.evaluate(
+                id_, policy, EPISODES, OTHER_SEED, num_threads=1
+            )
+        stored.clear()
+        stored.update(entry)
+        if best is own:  # last, since both files are written together
+            policies.save(policy, path)
     with runs.changing(policies.SHARED) as used:
         if id_ in used and used[id_]['evaluation'][score] < best['evaluation'][score]:
             del used[id_]  # the policy of another environment, which `share_gaits.py` has entered

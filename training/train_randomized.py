@@ -50,11 +50,12 @@ def train(id_: str, seed: int, output: pathlib.Path) -> None:
     folder = output / id_ / f'seed_{seed}'
     ppo.train(id_, seed, randomized_settings_for(id_), folder, threads=1)
     policy = trimmed(policies.load(folder / 'policy.npz'))
+    entry = {
+        **files.read_json(folder / 'curve.json'), 'machine': runs.machine(),
+        'shipped_at': policy.info['samples'], 'of': {'evaluations': digest(policy)},
+    }  # fmt: skip
     policies.save(policy, runs.place(place(id_)).with_suffix('.npz'))
-    curve = files.read_json(folder / 'curve.json')
-    runs.write(  # last: what is entered is not trained again
-        place(id_), {**curve, 'machine': runs.machine(), 'shipped_at': policy.info['samples']}
-    )
+    runs.write(place(id_), entry)  # last: what is entered is not trained again
 
 
 def measure(id_: str) -> dict[str, Any]:

@@ -304,17 +304,21 @@ class JobsTest(FolderTest):
         policy, settings = policies.reference(id_), train_all.settings(id_)
         with (
             mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
-            mock.patch.object(train_all.evaluation, 'evaluate', return_value={}),
+            mock.patch.object(train_all.evaluation, 'evaluate', return_value={}) as evaluate,
         ):
-            for seed, distance in ((1, 90), (2, 88), (3, 86), (1, 80), (2, 85), (3, 84)):
+            for seed, distance in ((1, 90), (2, 88), (3, 86), (1, 80), (2, 85), (3, 84), (2, 99)):
+                stop = distance == 99  # before the end
+                evaluate.side_effect = KeyboardInterrupt if stop else None
                 entry = {'seed': seed, 'settings': settings, 'evaluation': {'distance': distance}}
                 run = train_all.Run(
                     entry, dataclasses.replace(policy, info={'m': distance}), '', 1.0
                 )
-                train_all.enter(id_, seed, run, overwrite=True)
-                named = train_all.shipped(runs.read(f'{id_}.json'))['evaluation']['distance']
-                self.assertEqual(policies.load(self.folder / f'{id_}.npz').info['m'], named)
-            self.assertEqual((named, len(runs.read(f'{id_}.json')['runs'])), (85, 3))
+                with self.assertRaises(KeyboardInterrupt) if stop else contextlib.nullcontext():
+                    train_all.enter(id_, seed, run, overwrite=True)
+                stored, own = runs.read(f'{id_}.json'), policies.load(self.folder / f'{id_}.npz')
+                named = train_all.shipped(stored)['evaluation']['distance']
+                self.assertEqual((own.info['m'], digest(own)), (named, stored['of']))
+            self.assertEqual((named, len(stored['runs'])), (85, 3))
 
     def test_a_policy_that_others_use_is_kept(self):
         for id_ in 'abcd':
@@ -425,6 +429,8 @@ class GeneralistTest(FolderTest):
             generalist.enter(ids, policy, {'ids': ids})
             self.assertEqual(policies.available('generalist'), tuple(sorted(ids)))
             self.assertEqual(policies.reference(ids[0], 'generalist').id, ids[0])
+            entry = runs.read(f'generalist/{ids[-2]}.json')
+            self.assertEqual(entry, {'ids': ids, 'of': digest(policy)})
 
     @parameterized.parameters(*generalist.CHARACTERS)
     def test_what_is_shipped_has_the_results_of_its_file(self, character):
@@ -581,6 +587,16 @@ class PlannerTransferTest(absltest.TestCase):
         given = ('PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_Stand_Step-v0', '--each')
         with self.assertRaisesRegex(ValueError, '--each has one controller; expected at least two'):
             output(transfer_planners.main, *given)
+
+
+class RecordsTest(absltest.TestCase):
+    def test_records_are_of_the_policies_beside_them(self):
+        """Records from before digests were stored have none."""
+        for variant in ('', 'generalist'):
+            for path in runs.place(variant).glob('*_*.json'):
+                found, own = runs.read(f'{variant}/{path.name}'), path.with_suffix('.npz')
+                if 'of' in found:
+                    self.assertEqual(found['of'], digest(policies.load(own)), path)
 
 
 class StoredPagesTest(parameterized.TestCase):
