@@ -36,7 +36,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import learn_gaits
 import ppo
@@ -162,7 +162,36 @@ class Run(NamedTuple):
     seconds: float
 
 
-def train(id_: str, seed: int, output: pathlib.Path, samples: float | None, machine: str) -> Run:
+class Children:
+    """The processes that train; `stop` ends them, and no further ones are started."""
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen] = set()
+        self._stopped, self._lock = False, threading.Lock()
+
+    def run(self, command: Sequence[Any], log: IO[str]) -> int:
+        """Runs a command; returns its exit status."""
+        with self._lock:
+            if self._stopped:
+                raise RuntimeError('not trained, since the program was stopped')
+            child = subprocess.Popen(command, stdout=log, stderr=log)
+            self._running.add(child)
+        status = child.wait()
+        with self._lock:
+            self._running.remove(child)
+        return status
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            for child in self._running:
+                child.terminate()
+
+
+def train(
+    id_: str, seed: int, output: pathlib.Path, samples: float | None, machine: str,
+    children: Children,
+) -> Run:  # fmt: skip
     """Trains in a separate process, and evaluates."""
     begin = time.monotonic()
     script = pathlib.Path(program(id_).__file__ or '')
@@ -172,10 +201,10 @@ def train(id_: str, seed: int, output: pathlib.Path, samples: float | None, mach
     folder = output / id_ / f'seed_{seed}'
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / 'log.txt', 'a') as log:
-        ended = subprocess.run(command, check=False, stdout=log, stderr=log)
-    if ended.returncode:
+        status = children.run(command, log)
+    if status:
         *_, last = (folder / 'log.txt').read_text().split('\n')[:-1] or ['']
-        raise RuntimeError(f'{script.name} ended with status {ended.returncode}: {last}')
+        raise RuntimeError(f'{script.name} ended with status {status}: {last}')
     return measured(id_, folder, machine, begin)
 
 
@@ -311,7 +340,7 @@ def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callab
     return work
 
 
-def in_processes(arguments: argparse.Namespace) -> Callable[[str, int], Run]:
+def in_processes(arguments: argparse.Namespace, children: Children) -> Callable[[str, int], Run]:
     """Returns a function that trains in a process of this machine."""
 
     def work(id_: str, seed: int) -> Run:
@@ -319,7 +348,7 @@ def in_processes(arguments: argparse.Namespace) -> Callable[[str, int], Run]:
         folder = output / id_ / f'seed_{seed}'
         if arguments.overwrite:
             runs.remove(folder)
-        return train(id_, seed, output, arguments.samples, arguments.machine)
+        return train(id_, seed, output, arguments.samples, arguments.machine, children)
 
     return work
 
@@ -359,12 +388,15 @@ def main(words: Sequence[str] | None = None) -> None:
         if arguments.overwrite or not entered:
             todo.append((id_, seed))
     entering = threading.Lock()  # two seeds of one environment write the same file
-    failed = 0
+    failed, children = 0, Children()
     with contextlib.ExitStack() as stack:
-        done_by = on_ray(arguments, stack) if arguments.ray else in_processes(arguments)
+        done_by = on_ray(arguments, stack) if arguments.ray else in_processes(arguments, children)
         # Ray decides how many runs there are at a time.
         number = max(len(todo), 1) if arguments.ray else arguments.jobs
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(number))
+        # After an interrupt, before the pool waits for its threads.
+        stack.callback(children.stop)
+        stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         bar = stack.enter_context(tqdm.tqdm(total=len(todo), unit='run'))
 
         def work(id_: str, seed: int, before: list[concurrent.futures.Future]) -> Run:
@@ -382,7 +414,6 @@ def main(words: Sequence[str] | None = None) -> None:
             before = [future for future, (id_, _) in running.items() if id_ in others]
             running[pool.submit(work, *job, before)] = job
         bar.write(ROW.format('environment', 'seed', 'machine', 'minutes', 'return', 'complete'))
-        stack.callback(pool.shutdown, wait=False, cancel_futures=True)  # after an interrupt
         for done in concurrent.futures.as_completed(running):
             id_, seed = running[done]
             try:

@@ -7,8 +7,10 @@ import itertools
 import json
 import os
 import pathlib
+import signal
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 from unittest import mock
 
@@ -227,7 +229,7 @@ class JobsTest(FolderTest):
             done.append(id_)
             raise ValueError('no network')
 
-        self.enterContext(mock.patch.object(train_all, 'in_processes', lambda _: work))
+        self.enterContext(mock.patch.object(train_all, 'in_processes', lambda *_: work))
         self.enterContext(mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)))
 
         def train():
@@ -243,13 +245,40 @@ class JobsTest(FolderTest):
     def test_a_run_in_progress_is_not_overwritten(self):
         folder = self.folder / 'PD_Biped2D_Flat-v0' / 'seed_1'
         arguments = ['--runs', str(self.folder), '--overwrite', '--samples', '1']
-        work = train_all.in_processes(train_all.parsed(arguments))
+        work = train_all.in_processes(train_all.parsed(arguments), train_all.Children())
         with (
             runs.only_run(folder),
             self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
         ):
             work('PD_Biped2D_Flat-v0', 1)
         self.assertTrue(folder.exists())
+
+    def test_a_stop_ends_the_runs_and_enters_nothing(self):
+        """Of several runs, one at a time, the first has begun; the others never do."""
+        script, begun, children = self.folder / 'ppo.py', self.folder / 'begun', []
+        script.write_text(f'import time\nopen({str(begun)!r}, "w").close()\ntime.sleep(600)\n')
+
+        def started(*arguments, **options):
+            children.append(popen(*arguments, **options))
+            return children[-1]
+
+        def stopped(running):
+            while not begun.exists():
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+        popen, trained = subprocess.Popen, self.folder / 'trained'
+        words = f'--filter PD_Biped2D_[FIS]* --jobs 1 --runs {self.folder / "runs"}'.split()
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(trained)),
+            mock.patch.object(ppo, '__file__', str(script)),
+            mock.patch.object(train_all.subprocess, 'Popen', started),
+            mock.patch.object(train_all.concurrent.futures, 'as_completed', stopped),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            output(lambda: train_all.main(words))
+        self.assertEqual([child.returncode for child in children], [-signal.SIGTERM])
+        self.assertFalse(trained.exists())
 
     @parameterized.parameters(
         ('PD_Biped2D_Incline-v0', 'PD_Biped2D_Flat-v0'),
