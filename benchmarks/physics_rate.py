@@ -1,6 +1,7 @@
 """Determines the physics rate that each character needs, by convergence towards 1/3000 s.
 
     python benchmarks/physics_rate.py [--quick] [--json FILE] [--plot FILE]
+    python benchmarks/physics_rate.py --json docs/data/physics_rate.json --page benchmarks/physics_rate.md
 
 1/3000 s is the time step of the original. With contact, trajectories diverge exponentially, so no
 two rates agree for long, however accurate they are. Many short episodes are therefore run with the
@@ -16,7 +17,8 @@ deviation:
 Position and velocity control follow the clip open loop, torque and muscle control a smooth seeded
 sequence. Random full-range actions, continued after falls, test for divergence; in the air without
 actuators, damping, limits and contact, energy should be conserved. Finally solver settings are
-compared at the default rate. The conclusion is in physics_rate.md.
+compared at the default rate. The second command measures nothing: it writes the tables of
+physics_rate.md, which has the conclusion, from the JSON file.
 """
 
 import argparse
@@ -28,7 +30,7 @@ import numpy as np
 
 from trl_suite import suite
 from trl_suite.tasks.common.control import SUBSTEPS as DEFAULT
-from trl_suite.util import files
+from trl_suite.util import files, tables
 from trl_suite.util.program import begin_script
 
 RATES = (100, 40, 20, 10, 8, 5, 4)  # physics steps per control step of 1/30 s, finest first
@@ -418,16 +420,94 @@ def report(figures):
                 f'{name:36}{case:24}{1e3 * row["joints 0.1 s"][0]:8.1f}'
                 f'{row["reward difference"][0]:9.4f}{row["mean force difference"][0]:9.4f}'
             )
-    print('\nsolvers')
-    for name, rows in figures['solvers'].items():
-        for case, row in rows.items():
-            print(
-                f'{name:36}{case:36}{1e3 * row["joints 0.1 s"][0]:8.1f}'
-                f'{1e3 * row["joints 0.1 s, from 1/3000 s"][0]:8.1f}'
-                f'{row["reward difference"][0]:9.4f}{row["mean force difference"][0]:9.4f}'
-                f'{row["diverged share"]:7.3f}'
-                f'{row["physics us"] / rows["as it is"]["physics us"]:7.2f}'
-            )
+    print(f'\nsolvers\n{solver_table(figures)}')
+
+
+def rate(substeps):
+    return f'1/{CONTROL_RATE * int(substeps)}'
+
+
+def spread(values, digits):
+    """Returns a value and its interval with signs."""
+    value, low, high = (f'{each:+.{digits}f}' for each in values)
+    return f'{value} ({low}, {high})'
+
+
+def deviation_table(figures):
+    compared = [n for n in figures['rates'] if n != REFERENCE]
+    rows = []
+    for name, found in figures['groups'].items():
+        ratios = (f'{found[str(n)]["joints 0.1 s / perturbed"]:.2f}' for n in compared)
+        angles = (f'{1e3 * found[case]["joints 0.1 s"][0]:.1f}' for case in (str(DEFAULT), 'soft'))
+        rows.append((name, *ratios, *angles, rate(found['chosen'])))
+    rates = (f'**{rate(n)}**' if n == DEFAULT else rate(n) for n in compared)
+    more = f'mrad at {rate(DEFAULT)}', 'mrad, softness alone', 'meets all bounds'
+    return tables.markdown_table(('character, actuation', *rates, *more), rows)
+
+
+def measure_table(figures):
+    limits, depths = (20, DEFAULT, 8, 5), (REFERENCE, DEFAULT, 8, 5)
+    rows = []
+    for name, found in figures['groups'].items():
+        row, impulse = found[str(DEFAULT)], found[str(REFERENCE)]['peak impulse'][0]
+        rows.append((
+            name, spread(row['reward difference'], 3), spread(row['mean force difference'], 3),
+            f'{impulse:.1f}, {spread(row["peak impulse difference"], 1)}',
+            ', '.join(f'{found[str(n)]["random limit violation"]:.2f}' for n in limits),
+            ', '.join(f'{1e3 * found[str(n)]["random penetration"]:.0f}' for n in depths),
+        ))  # fmt: skip
+    header = (
+        'character, actuation', 'reward', 'mean force', 'peak impulse',
+        f'beyond limits, rad: {", ".join(map(rate, limits))}',
+        f'depth, mm: {", ".join(map(rate, depths))}',
+    )  # fmt: skip
+    return tables.markdown_table(header, rows)
+
+
+def cost_table(figures):
+    rows = []
+    for title, name in (('physics alone', 'physics us'),
+                        ('whole step of a single environment', 'step us')):  # fmt: skip
+        ratios = [
+            [found[str(n)][name] / found[str(DEFAULT)][name] for n in figures['rates']]
+            for found in figures['groups'].values()
+        ]
+        rows.append((title, *(f'{ratio:.2f}' for ratio in np.median(ratios, axis=0))))
+    return tables.markdown_table(('', *map(rate, figures['rates'])), rows)
+
+
+def solver_table(figures):
+    rows = []
+    for name in SOLVERS:
+        cases = [
+            (found[name], found['as it is']['physics us']) for found in figures['solvers'].values()
+        ]
+        shares = [row['diverged share'] for row, _ in cases]
+        times = [row['physics us'] / default for row, default in cases]
+        rows.append((
+            name,
+            *(f'{1e3 * max(row[key][0] for row, _ in cases):.1f}'
+              for key in ('joints 0.1 s', 'joints 0.1 s, from 1/3000 s')),
+            f'{np.count_nonzero(shares)} of {len(shares)}', tables.share(max(shares), figures['random episodes'] // 2),
+            f'{min(times):.2f} to {max(times):.2f}',
+        ))  # fmt: skip
+    header = (
+        'setting', 'joint angles after 0.1 s change by, mrad', 'they deviate from 1/3000 s by, mrad',
+        'cases with divergence', 'diverged episodes', 'physics time',
+    )  # fmt: skip
+    return tables.markdown_table(header, rows)
+
+
+def blocks(figures):
+    """Returns the parts of the page that have figures, by their names."""
+    starts, episodes = figures['starts'], figures['random episodes']
+    return {
+        'deviations': f'{starts} starts (seeds 0 to {starts - 1}):\n\n{deviation_table(figures)}',
+        'measures': f'{starts} starts, {episodes} random episodes:\n\n{measure_table(figures)}',
+        'costs': cost_table(figures),
+        'solvers': f'{len(figures["solvers"])} cases, {starts} starts, {episodes // 2} random '
+        f'episodes; the largest of the cases, and the range of the time:\n\n{solver_table(figures)}',
+    }
 
 
 def rounded(value):
@@ -491,7 +571,16 @@ def main():
     parser.add_argument('--quick', action='store_true', help='few starts, as a test of the program')
     parser.add_argument('--json', type=pathlib.Path, help='write the figures to this file')
     parser.add_argument('--plot', help='plot the figures to this file')
+    parser.add_argument(
+        '--page', type=pathlib.Path, help='only write the tables of --json into this page'
+    )
     arguments = parser.parse_args()
+    if arguments.page:
+        if arguments.json is None:
+            parser.error('--page needs --json')
+        for name, text in blocks(files.read_json(arguments.json)).items():
+            files.replace_between(arguments.page, name, 'benchmarks/physics_rate.py', text)
+        return
     starts, episodes = (3, 2) if arguments.quick else (STARTS, RANDOM_EPISODES)
     figures = {
         'mujoco': mujoco.__version__, 'rates': RATES, 'starts': starts,
