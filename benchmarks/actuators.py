@@ -297,16 +297,21 @@ def effect_table(found: dict[str, object]) -> str:
     return tables.markdown_table(('policy', 'return, ideal', *STRENGTHS), rows)
 
 
-def page() -> None:
-    """Writes the tables between their markers."""
+def blocks() -> dict[str, str]:
+    """Returns the tables of the page, by their names."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
     parts = {'options': tables.markdown([table_of(actuation.Actuators)])}
     if 'costs' in found:
         parts['costs'] = cost_table(found['costs'])
     if 'effects' in found:
         parts['effects'] = effect_table(found['effects'])
-    for name, part in parts.items():
-        files.replace_between(PAGE, name, 'benchmarks/actuators.py', f'\n{part.strip()}\n')
+    return {name: f'\n{part.strip()}\n' for name, part in parts.items()}
+
+
+def page() -> None:
+    """Writes the tables between their markers."""
+    for name, part in blocks().items():
+        files.replace_between(PAGE, name, 'benchmarks/actuators.py', part)
 
 
 if __name__ == '__main__':

@@ -87,12 +87,9 @@ def preset(entry: dict[str, Any]) -> str:
 
 def table(entries: list[dict[str, Any]]) -> str:
     """Returns the results as Markdown."""
-    found = [each for entry in entries for name in TITLES for each in entry[name].values()]
-    episodes = [each['episodes'] for each in found]
     text = (
-        f'Mean returns of {min(episodes)} to {max(episodes)} episodes with 95 % confidence, and in brackets the share of '
-        'complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` what the '
-        'training has cost without disturbances.'
+        'Mean returns, and shares of complete episodes, with 95 % intervals (of shares: Wilson). `robot / none` '
+        'is what a policy keeps of its own return, and `none / shipped` what the training has cost without disturbances.'
     )
     rows = []
     for entry in entries:
@@ -101,13 +98,15 @@ def table(entries: list[dict[str, Any]]) -> str:
             none, robot = each['none']['return'], each['robot']['return']
             rows.append([
                 f'`{entry["id"]}`' if name == 'before' else '', title.format(preset(entry)),
+                ', '.join(sorted({f'{r["episodes"]}' for r in each.values()})),
                 *(
-                    f'{r["return"]:.1f} ± {r["return_interval"]:.1f} ({r["completion_rate"]:.0%})'
+                    f'{r["return"]:.1f} ± {r["return_interval"]:.1f}, '
+                    + tables.share(r['completion_rate'], r['episodes'])
                     for r in map(each.get, CONDITIONS)
                 ),
                 f'{robot / none:.2f}', f'{none / shipped:.2f}',
             ])  # fmt: skip
-    head = ['environment', 'policy', *CONDITIONS, 'robot / none', 'none / shipped']
+    head = ['environment', 'policy', 'episodes', *CONDITIONS, 'robot / none', 'none / shipped']
     return f'{text}\n\n{tables.markdown_table(head, rows)}'
 
 

@@ -45,6 +45,14 @@ from trl_suite.util import files
 from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / 'benchmarks'))
+import actuators
+import contacts
+import physics_rate
+import robustness
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
 
 class CompareTest(FolderTest):
     def run_program(self, name, job, *arguments):
@@ -645,6 +653,25 @@ class StoredPagesTest(parameterized.TestCase):
         text = (results.DOCS / f'reports/{page}.md').read_text('utf-8')
         block = compare.described(compare.COMPARISONS[name], found)
         self.assertEqual(files.between(text, name, 'training/compare.py', block), text)
+
+    def test_benchmarks(self):
+        entries = [runs.read(train_randomized.place(id_)) for id_ in settings.RANDOMIZED]
+        data = {
+            name: files.read_json(results.DOCS / f'data/{name}.json')
+            for name in ('robustness', 'contacts', 'physics_rate')
+        }
+        for page, program, blocks in (
+            ('docs/reports/robustness.md', robustness, {'robustness': robustness.table(data['robustness'])}),
+            ('docs/reports/robustness.md', contacts, {'contacts': contacts.table(data['contacts'])}),
+            ('docs/reports/robustness.md', train_randomized, {'randomized': train_randomized.table(entries)}),
+            ('docs/realism.md', actuators, actuators.blocks()),
+            ('benchmarks/physics_rate.md', physics_rate, physics_rate.blocks(data['physics_rate'])),
+        ):  # fmt: skip
+            text = (ROOT / page).read_text('utf-8')
+            path = pathlib.Path(program.__file__).relative_to(ROOT).as_posix()
+            for name, block in blocks.items():
+                with self.subTest(name):
+                    self.assertEqual(files.between(text, name, path, block), text)
 
 
 class PageTest(FolderTest):
