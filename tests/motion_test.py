@@ -262,6 +262,11 @@ class ConstructionTest(parameterized.TestCase):
             (lambda: free().mirrored([('ball', 'hinge')]), 'differ in kind'),
             (lambda: motion.load('biped2d_wlak'), "unknown clip 'biped2d_wlak'.*'biped2d_walk'"),
             (lambda: motion.load('biped3d_mocap_steps'), 'unknown clip'),
+            *(
+                (functools.partial(each.save, name), f"unknown suffix '{suffix}'; expected .npz")
+                for each in (planar(), steps())
+                for name, suffix in (('walk', ''), ('walk.txt', '.txt'))
+            ),
             (lambda: motion.load_steps('biped3d'), "step library 'biped3d'.*'biped3d_mocap'"),
         )
 
@@ -279,14 +284,16 @@ class FileTest(FolderTest):
     @parameterized.parameters(planar, free, circle)
     def test_round_trip(self, make):
         path = self.folder / 'clip.npz'
+        (self.folder / 'other').mkdir()
         clip = dataclasses.replace(make(), name='clip', description='Größe')
         clip.save(path)
-        for found in (motion.load(path), motion.load(str(path))):
+        clip.save(self.folder / 'other' / 'clip.NPZ')
+        for found in map(motion.load, (path, str(path), f'{self.folder}/other/clip.NPZ')):
             for field in dataclasses.fields(clip):
                 np.testing.assert_array_equal(
                     getattr(found, field.name), getattr(clip, field.name), field.name
                 )
-        self.assertEqual(os.listdir(self.folder), ['clip.npz'])
+        self.assertEqual({*os.listdir(self.folder)}, {'clip.npz', 'other'})
 
     def test_truncated_or_damaged_files_are_rejected(self):
         path, single = self.folder / 'bad.npz', io.BytesIO()
@@ -515,7 +522,7 @@ class ReaderTest(FolderTest):
         self.assertFalse(self.deepmimic(Loop='none', CycleSyncRootRot=True).turning)
         assert_refused(self, *((lambda f=f: self.deepmimic(Loop='wrap', **f), f'walk.txt: {message}') for f, message in (
             ({'CycleSyncRootRot': 1}, 'CycleSyncRootRot is 1; expected True or False'),
-            ({'CycleSyncRootPos': False}, 'CycleSyncRootPos: False is not supported'))))  # fmt: skip
+            ({'CycleSyncRootPos': False}, 'CycleSyncRootPos is False; expected True'))))  # fmt: skip
         wrong = functools.partial(self.deepmimic, Loop=True)
         assert_refused(self, (wrong, "walk.txt: Loop is True; expected 'wrap' or 'none'"))
 

@@ -6,8 +6,11 @@ import functools
 import importlib.util
 import io
 import json
+import os
 import pathlib
 import re
+import subprocess
+import sys
 
 import numpy as np
 from absl.testing import parameterized
@@ -289,8 +292,10 @@ class ReadingTest(ClipTest):
             found = retargeting.read(path.rename(self.folder / 'walk.txt'), PLAIN, skeleton)
             np.testing.assert_array_equal(found.rotations, expected.rotations)
         clip = motion.load('biped2d_walk')
-        for write in (clip.save, lambda path: write_terrainrl(clip, path)):
-            write(self.folder / 'walk.txt')
+        clip.save(self.folder / 'walk.npz')
+        write_terrainrl(clip, self.folder / 'walk.json')
+        for name in ('walk.npz', 'walk.json'):
+            (self.folder / name).rename(self.folder / 'walk.txt')
             found = retargeting.read(self.folder / 'walk.txt', 'biped2d')
             np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
 
@@ -298,8 +303,29 @@ class ReadingTest(ClipTest):
         (self.folder / 'note.bvh').touch()
         with self.assertRaisesRegex(FileNotFoundError, "did you mean 'note.bvh'"):
             retargeting.read(self.folder / 'none.bvh', PLAIN)
-        with self.assertRaisesRegex(ValueError, 'rate: not an option of .bvh files'):
-            retargeting.read(self.capture()[0], PLAIN, rate=60)
+        bvh, asf, amc = self.capture()
+        for path, skeleton, option, message in (
+            (bvh, None, 'rate', r"a\.bvh: .* of .bvh files 'rate'; known: forward, unit, up"),
+            (amc, asf, 'fwd', r"a\.amc: .* of .amc files 'fwd'; did you mean 'forward'"),
+        ):
+            read = functools.partial(retargeting.read, path, PLAIN, skeleton, **{option: 60})
+            assert_refused(self, (read, message))
+        bvh.write_text(bvh.read_text().replace('Spine1', 'Rücken'), encoding='utf-8')
+        code = f"""if True:
+            from trl_suite import motion
+            try:
+                motion.read_bvh({str(bvh)!r})
+            except ValueError as error:
+                print(ascii(str(error)))
+        """
+        ascii_only = {'LC_ALL': 'POSIX', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+        out = subprocess.run(
+            [sys.executable, '-c', code],
+            env=os.environ | ascii_only,
+            capture_output=True,
+            check=True,
+        ).stdout.decode()
+        self.assertRegex(out, r'a\.bvh: .*xfc.* is not in the encoding of the system, ascii')
         for name, text, message, skeleton in UNUSABLE:
             asf = self.folder / 'a.asf' if skeleton else None
             (self.folder / 'a.asf').write_text(skeleton or '')

@@ -84,9 +84,14 @@ def read_bvh(
     pybvh = library('pybvh', 'trl_suite[clips]')
     with tempfile.TemporaryDirectory() as folder:
         copy = pathlib.Path(folder, 'copy.bvh')  # pybvh reads no other suffix
-        copy.write_text(text)
         try:
+            copy.write_text(text)  # in the encoding of the system, in which pybvh reads
             found = pybvh.read_bvh_file(copy, world_up='+y', warn_on_world_up_disagreement=False)
+        except UnicodeEncodeError as error:
+            raise ValueError(
+                f'{path}: {text[error.start : error.end]!r} is not in the encoding of the system, '
+                f'{error.encoding}; expected other names, or Python with -X utf8'
+            ) from None
         except (ValueError, IndexError) as error:
             raise ValueError(f'{path}: {error}'.replace(str(copy), path.name)) from None
         except OverflowError:

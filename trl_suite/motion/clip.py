@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from trl_suite.motion import quaternion
 from trl_suite.motion.layout import LARGEST, SHORTEST, Layout, Mirror
 from trl_suite.util import archive, errors, resources
+from trl_suite.util.files import check_path
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
 STEPS_SUFFIX = '_steps'  # suffix of files that contain a step library instead of a clip
@@ -210,7 +211,13 @@ class Clip:
         return dataclasses.replace(self, poses=mirror.pose(self.poses))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the clip as .npz without pickled objects; an existing file is replaced at the end."""
+        """Writes the clip as .npz without pickled objects; an existing file is replaced at the end.
+
+        Raises:
+          ValueError: another suffix.
+          OSError: the file cannot be written.
+        """
+        path = check_path(path, ('.npz',))
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
@@ -242,7 +249,7 @@ def shipped(
     path_or_name: str | os.PathLike[str], kind: str, known: list[str], suffix: str = ''
 ) -> pathlib.Path:
     """Returns the path of a shipped file, or the argument if it is a PathLike or ends in .npz."""
-    if not isinstance(path_or_name, str) or path_or_name.endswith('.npz'):
+    if not isinstance(path_or_name, str) or path_or_name.lower().endswith('.npz'):
         return pathlib.Path(path_or_name)
     errors.check_known(kind, known, path_or_name)
     return resources.directory('mocap') / f'{path_or_name}{suffix}.npz'

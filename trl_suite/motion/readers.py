@@ -136,7 +136,7 @@ def read_deepmimic(
     if looping:
         if motion.get('CycleSyncRootPos', True) is not True:
             found = motion['CycleSyncRootPos']
-            raise ValueError(f'{path}: CycleSyncRootPos: {found!r} is not supported')
+            raise ValueError(f'{path}: CycleSyncRootPos is {found!r}; expected True')
         if not checked(
             f'{path}: CycleSyncRootHeight', motion.get('CycleSyncRootHeight', False), bool
         ):

@@ -27,6 +27,7 @@ from trl_suite.motion import quaternion
 from trl_suite.motion.clip import STEPS_SUFFIX, VELOCITY_STEP, Clip, shipped
 from trl_suite.motion.layout import LARGEST, Layout
 from trl_suite.util import archive, errors, resources
+from trl_suite.util.files import check_path
 
 FEATURES = (
     *('right foot ahead of the root', 'right foot left of the root'),
@@ -178,7 +179,13 @@ class FootstepLibrary:
         return np.argmin((gap * gap).sum(axis=2), axis=1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the library as .npz without pickled objects; replaces an existing file at the end."""
+        """Writes the library as .npz without pickled objects; replaces an existing file at the end.
+
+        Raises:
+          ValueError: another suffix.
+          OSError: the file cannot be written.
+        """
+        path = check_path(path, ('.npz',))
         found = {field: getattr(self, field) for field in (*_FIELDS, *_LEFT)}
         archive.write(path, {field: value for field, value in found.items() if value is not None})
 

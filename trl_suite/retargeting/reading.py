@@ -10,6 +10,7 @@ from trl_suite.motion import Capture, Clip, readers
 from trl_suite.motion import clip as clips
 from trl_suite.motion.capture import read_amc, read_bvh
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.util import errors
 from trl_suite.util.files import Path, existing, read_json
 
 FORMATS = {
@@ -50,8 +51,8 @@ def read(
     own = {'bvh': ('unit', 'forward', 'up'), 'amc': ('rate', 'unit', 'forward', 'up')}.get(
         found, ()
     )
-    if foreign := [name for name in options if name not in own]:
-        raise ValueError(f'{path}: {", ".join(foreign)}: not an option of .{found} files')
+    with errors.naming(path):
+        errors.check_known(f'option of .{found} files', own, *options)
     if found == 'bvh':
         return read_bvh(path, **options)
     if found == 'amc':
