@@ -11,26 +11,50 @@ import pathlib
 import re
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 from absl.testing import parameterized
-from helpers import FolderTest, assert_refused, write_terrainrl
+from helpers import FolderTest, assert_refused, in_this_process, write_terrainrl
 from scipy.spatial.transform import Rotation
 
-from trl_suite import motion, retargeting, suite
+from trl_suite import characters, motion, retargeting, suite
 from trl_suite.motion import quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.retargeting import clip_check
+from trl_suite.util import limited
 
 # From y up, z forward to the suite's frame.
 FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
+# The axes of a leg are turned: its y axis points up, its z axis to the right, (0, -1, 0).
+LEG = """<body name="{0}_thigh" pos="0 {1} -.1" euler="90 0 0"><joint name="{0}_hip" axis="{2}"/>
+<geom type="capsule" size=".04" fromto="0 0 0 0 -.4 0"/></body>"""
 
 
 def in_file(rotation):
     """Converts a rotation to a file's frame."""
     return Rotation.from_matrix(FILE_AXES.T @ rotation.as_matrix() @ FILE_AXES)
+
+
+def legs(folder, axis):
+    """Returns a character of two legs from a file, with hips about an axis of the legs."""
+    path = folder / 'legs.xml'
+    both = LEG.format('right', -0.1, axis) + LEG.format('left', 0.1, axis)
+    path.write_text(
+        f'<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/><geom size=".1"/>{both}</body>'
+        '</worldbody></mujoco>'
+    )
+    with mock.patch.object(limited, 'call', in_this_process):
+        return characters.from_file(path)
+
+
+def free(times, place, turns, **joints):
+    """Returns a clip with a free root, at places (n, 3) m, with Rotations, and hinge angles (n,)."""
+    quaternions = np.roll(turns.as_quat(), 1, axis=-1)
+    poses = np.column_stack([place, quaternions, *joints.values()])
+    return motion.Clip('free', times, poses, 'free', tuple(joints), (1,) * len(joints))
 
 
 def rotations(quaternions):
@@ -389,6 +413,100 @@ class RetargetTest(ClipTest):
         )
         np.testing.assert_allclose(turned.poses[:, 2:], clip.poses[:, 2:], atol=1e-5)
 
+    @parameterized.parameters(
+        ('forwards', 2),
+        ('backwards', -2),
+        ('sideways', 0),
+        ('circle', 2 * np.pi),
+        ('back and forth', 4),
+    )
+    def test_the_way_of_a_planar_character_is_that_along_the_heading(self, way, expected):
+        t = np.linspace(0, 1, 201)
+        heading, place = 2.0 + 0 * t, 2 * np.stack([t, 0 * t], 1)
+        if way == 'circle':  # of radius 1 m
+            heading, place = (
+                2 * np.pi * t,
+                np.stack([np.sin(2 * np.pi * t), -np.cos(2 * np.pi * t)], 1),
+            )
+        elif way == 'back and forth':  # 2 m, a turn on the spot, 2 m
+            heading = 2.0 + np.pi * np.clip(3 * t - 1, 0, 1)
+            place[:, 0] = 2 * (np.clip(3 * t, 0, 1) - np.clip(3 * t - 2, 0, 1))
+        if way != 'circle':
+            turn = 2.0 + {'backwards': np.pi, 'sideways': np.pi / 2}.get(way, 0.0)
+            place = quaternion.rotate_xy(place, np.full(201, turn))
+        clip = free(
+            t, np.c_[place, 1 + 0 * t], Rotation.from_euler('z', heading[:, None]), left_knee=-t
+        )
+        found = retargeting.retarget(clip, 'biped2d', scale=1.0)
+        np.testing.assert_allclose(found.poses[[0, -1], 0], [0, expected], atol=1e-3)
+        self.assertLessEqual(np.abs(np.diff(found.poses[:, 0])).max(), np.pi / 90)  # without jumps
+        np.testing.assert_allclose(found.poses[:, 2], 0, atol=1e-9)
+        if way in ('forwards', 'backwards'):  # in space it moves along x, and faces where it did
+            spatial = retargeting.retarget(clip, PLAIN, scale=1.0)
+            np.testing.assert_allclose(spatial.displacement[:2], [2, 0], atol=1e-9)
+            facing = quaternion.rotate(spatial.poses[0, 3:7], np.array([1.0, 0, 0]))
+            np.testing.assert_allclose(facing, [np.sign(expected), 0, 0], atol=1e-9)
+
+    @parameterized.product(order=('ZXY', 'ZYX'), roll=(0.0, 0.3, -0.3))
+    def test_a_somersault_that_leans(self, order, roll):
+        """About an axis that is inclined, or with the body inclined to a level axis."""
+        t = np.linspace(0, 1, 61)
+        angles = {'Z': 0.4 + 0 * t, 'Y': 2 * np.pi * t, 'X': roll + 0 * t}
+        turns = Rotation.from_euler(order, np.stack([angles[axis] for axis in order], 1))
+        place = np.stack([t * np.cos(0.4), t * np.sin(0.4), 1 + 0 * t], 1)
+        clip = retargeting.retarget(free(t, place, turns, left_knee=-t), 'biped2d', scale=1.0)
+        # The pitch of clips is about (0, -1, 0).
+        exact = order == 'ZXY' or not roll
+        np.testing.assert_allclose(clip.poses[:, 2], -2 * np.pi * t, atol=1e-9 if exact else 0.03)
+        np.testing.assert_allclose(clip.poses[:, 0], t, atol=1e-9 if exact else 0.05)
+
+    def test_the_root_follows_another_joint(self):
+        figure = Figure(FULL, motion.load('biped3d_full_walk'), 31)
+        write_bvh(figure, self.folder / 'walk.bvh')
+        capture = retargeting.read(self.folder / 'walk.bvh', FULL)
+        names = {name: bvh_name(name) for name in figure.names} | {'root': 'Neck'}
+        del names['torso']
+        clip = retargeting.retarget(capture, FULL, names, 1.0)
+        viewer, place = KinematicViewer(FULL), []
+        for pose in figure.poses:
+            viewer.put(pose)
+            place.append(viewer.places()[figure.names.index('neck')])
+        place = np.array(place) - place[0]
+        np.testing.assert_allclose(clip.poses[:, :3] - clip.poses[0, :3], place, atol=1e-5)
+
+    @parameterized.parameters(('0 0 1', 1), ('0 0 -2', -1), ('0 1 0', 0), ('1 0 0.1', 0))
+    def test_hinges_of_clips_are_lateral(self, axis, sign):
+        """Also on links whose axes are not those of the world."""
+        character, t = legs(self.folder, axis), np.linspace(0, 1, 11)
+        clip = free(t, np.c_[t, 0 * t, 1 + 0 * t], Rotation.identity(11), left_hip=0.5 * t)
+        retarget = functools.partial(retargeting.retarget, clip, character)
+        if not sign:
+            assert_refused(
+                self, (retarget, r"the axis of 'left_hip' is \[.*\], but that of 'left_hip'")
+            )
+            return
+        found = retarget()
+        column, _ = found.layout.starts('left_hip')
+        np.testing.assert_allclose(found.poses[:, column], 0.5 * sign * t, atol=1e-9)
+
+    def test_a_jump_does_not_make_a_clip_small(self):
+        t = np.linspace(0, 1, 31)
+        place = np.stack([t, 0 * t, np.where(t > 0.6, 1.8, 0.9)], 1)
+        clip = free(t, place, Rotation.identity(31), left_knee=-t)
+        found = retargeting.retarget(clip, PLAIN)
+        size = KinematicViewer(PLAIN).standing()[2] / 0.9
+        np.testing.assert_allclose(found.displacement, [size, 0, 0.9 * size], atol=1e-9)
+
+    def test_a_capture_without_limbs_needs_a_scale(self):
+        figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 4)
+        write_bvh(figure, self.folder / 'walk.bvh')
+        capture = retargeting.read(self.folder / 'walk.bvh', PLAIN)
+        joints = {'root': 'Hips', 'left_knee': 'LeftLeg'}
+        retarget = functools.partial(retargeting.retarget, capture, PLAIN, joints)
+        assert_refused(self, (retarget, r'no two joints at the ends of a limb .* pass scale='))
+        ways = [retarget(scale=scale).displacement for scale in (1.0, 2.0)]
+        np.testing.assert_allclose(2 * ways[0], ways[1], atol=1e-9)
+
     def test_usual_names(self):
         ours = ('root', *motion.load('biped3d_full_walk').joints)
         for theirs in (
@@ -486,7 +604,9 @@ class CheckTest(parameterized.TestCase):
             (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_nee': 'left_knee'}, "unknown joint of the character 'left_nee'"),
             (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_knee': 'knee'}, "joint of the motion 'knee'; did you mean"),
             (retargeting.retarget, walk, 'dog', 'the root, or all other joints'),
-            (retargeting.retarget, dataclasses.replace(walk, poses=walk.poses - 2 * np.eye(1, walk.poses.shape[1], 1)), 'raptor', 'its root is never above 0'),
+            (retargeting.retarget, dataclasses.replace(walk, poses=walk.poses - 2 * np.eye(1, walk.poses.shape[1], 1)), 'raptor', 'median height of its root is -1.* expected more than 0, or pass scale='),
+            (retargeting.retarget, walk, 'raptor', {'root': 'left_knee', 'left_knee': 'left_knee'}, "'root' follows 'left_knee' of clip"),
+            (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_knee': 'root'}, "'left_knee' follows 'root' of clip .*; expected the root"),
             (retargeting.retarget, walk, 'raptor', None, 0, 'scale is 0'), (retargeting.cycle, walk, 0.1, 'both or none'),
             (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1 s'), (retargeting.cycle, short, 'lasts 0.2 s'),
             (motion.read_bvh, __file__, 0.01, 'w', "forward is 'w'"),

@@ -19,8 +19,8 @@ from trl_suite.util.options import checked
 
 STRAIGHT = 0.2  # m; a motion with a larger displacement is rotated to +x by it, not by its heading
 SINKING = 0.05  # fraction of frames that may penetrate the ground; captured heights are inexact
+SLANT = 0.7  # cosine; a hinge whose axis is farther from the lateral one does not follow a clip's
 _LATERAL = np.array([0.0, -1.0, 0.0])  # axis of pitch, and of hinges in files of the original
-_VERTICAL = np.array([0.0, 0.0, 1.0])
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 # Names of the joints in other formats; the first that exists is used: TerrainRL and DeepMimic,
@@ -70,6 +70,10 @@ def counterparts(
     """Returns the map from root and joints of a character to joints of a motion.
 
     It is the given one, by default that of `guess_map`.
+
+    Raises:
+      ValueError: unknown joints, no root or nothing but the root, or for a clip, whose root is no joint,
+        a root that follows a joint, or a joint that follows the root.
     """
     ours, theirs = ('root', *joints), _joints(motion)
     chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)
@@ -80,6 +84,12 @@ def counterparts(
             f'motion {motion.name!r}: the root, or all other joints, have no counterpart; pass a '
             f'joint_map from {", ".join(ours)} to {", ".join(theirs)}'
         )
+    for our, their in chosen.items() if isinstance(motion, Clip) else ():
+        if (our == 'root') is not (their == 'root'):
+            raise ValueError(
+                f'joint_map: {our!r} follows {their!r} of clip {motion.name!r}; expected the root, and no '
+                'other joint, to follow the root'
+            )
     return chosen
 
 
@@ -97,8 +107,14 @@ def retarget(
 
     The motion is rotated so that its displacement (or its heading, if it stays in place) is along
     +x, moved to the origin, scaled, and put on the ground: all but the lowest 5 % of the frames are
-    above it. A clip that has the character's layout already is returned unchanged, unless a map or
-    a scale is given.
+    above it. A planar character, which has no heading, travels along x what the motion travels along
+    its own heading: backwards for a walk backwards, and the length of the way for a walk in a circle.
+    A clip that has the character's layout already is returned unchanged, unless a map or a scale is
+    given.
+
+    Hinges of a clip are taken to be about the lateral axis, (0, -1, 0), and its links to have the axes
+    of the world when all joints are at 0, as in the suite's characters. Clips of other characters are
+    transferred wrongly.
 
     Args:
       motion: the result of `read`.
@@ -106,14 +122,15 @@ def retarget(
       joint_map: joint of the character -> joint of the motion, with 'root' for the root; joints
         that are not in it stay at 0. By default by usual names, see `guess_map`.
       scale: factor on lengths; by default the ratio of limb lengths of the character to those of a
-        capture, or of the height of its root to the largest height of a clip's.
+        capture, or of the height of its root to the median height of a clip's.
 
     Returns:
       A clip in the character's layout; it loops if the motion does.
 
     Raises:
-      ValueError: unknown joints, no root in the map, a scale that is not positive, or none for a clip
-        whose root is never above 0.
+      ValueError: a map that `counterparts` refuses, or from a clip's hinge to one that is not about the
+        lateral axis; a scale that is not positive; or no scale, for a clip whose root is at or below 0
+        or a capture without a limb in the map.
     """
     figure = KinematicViewer(character)
     layout = figure.layout
@@ -124,21 +141,30 @@ def retarget(
     theirs, chosen = _joints(motion), counterparts(motion, layout.joints, joint_map)
     checked('scale', scale, float | None, above=0)
     if isinstance(motion, Capture):
-        path, turns = motion.positions, motion.rotations[:, theirs.index(chosen['root'])]
+        root = theirs.index(chosen['root'])
+        path, turns = _place(motion, root), motion.rotations[:, root]
         size = _limbs(figure, motion, chosen) if scale is None else scale
     else:
         path, turns = _root(motion)
         standing = figure.standing()[1 if layout.root == 'planar' else 2]
-        if scale is None and path[:, 2].max() <= 0:
-            raise ValueError(f'clip {motion.name!r}: its root is never above 0; pass scale=')
-        size = standing / path[:, 2].max() if scale is None else scale
-    yaw = _yaw(path, turns)
+        usual = float(np.median(path[:, 2]))
+        if scale is None and usual <= 0:
+            raise ValueError(
+                f'clip {motion.name!r}: the median height of its root is {usual:.3g} m; expected more than '
+                '0, or pass scale='
+            )
+        size = standing / usual if scale is None else scale
     path = path - [*path[0, :2], 0]
-    path[:, :2] = quaternion.rotate_xy(path[:, :2], np.full(len(path), -yaw))
-    upright = quaternion.about_z(np.full(len(path), -yaw))
-    if layout.root == 'planar':  # no heading: the motion is along x
-        aside = quaternion.angle_about(quaternion.multiply(upright, turns), _VERTICAL)
-        upright = quaternion.multiply(quaternion.about_z(-aside), upright)
+    if layout.root == 'planar':
+        # From the lateral axis, the heading is exact at any pitch, also upside down.
+        across = quaternion.rotate(turns, -_LATERAL)
+        yaw = np.unwrap(np.arctan2(-across[:, 0], across[:, 1]))
+        steps = quaternion.rotate_xy(np.diff(path[:, :2], axis=0), -(yaw[1:] + yaw[:-1]) / 2)
+        path[1:, 0] = np.cumsum(steps[:, 0])
+    else:
+        yaw = np.full(len(path), _yaw(path, turns))
+        path[:, :2] = quaternion.rotate_xy(path[:, :2], -yaw)
+    upright = quaternion.about_z(-yaw)
     links = _captured(figure, motion, chosen, upright) if isinstance(motion, Capture) else None
     poses = _poses(figure, motion, chosen, size * path, quaternion.multiply(upright, turns), links)
     height = 1 if layout.root == 'planar' else 2
@@ -155,6 +181,16 @@ def _root(motion: Clip) -> tuple[np.ndarray, np.ndarray]:
         return motion.poses[:, :3].copy(), motion.poses[:, 3:7]
     x, z, pitch = motion.poses[:, :3].T
     return np.stack([x, 0 * x, z], axis=1), quaternion.from_vector(pitch[:, None] * _LATERAL)
+
+
+def _place(motion: Capture, joint: int) -> np.ndarray:
+    """Returns the positions of a capture's joint, m, (n, 3)."""
+    path = motion.positions
+    while (parent := motion.parents[joint]) >= 0:
+        offset = motion.rest[joint] - motion.rest[parent]
+        path = path + quaternion.rotate(motion.rotations[:, parent], offset)
+        joint = parent
+    return path
 
 
 def _yaw(path: np.ndarray, turns: np.ndarray) -> float:
@@ -193,10 +229,19 @@ def _vectors(
 
 
 def _limbs(figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]) -> float:
-    """Returns the ratio of limb lengths of the character to those of the motion."""
+    """Returns the ratio of limb lengths of the character to those of the motion.
+
+    Raises:
+      ValueError: no limb of the character, from a joint to the next, follows the motion.
+    """
     pairs = _vectors(figure, motion, chosen).values()
     mine, other = (sum(float(np.linalg.norm(pair[i])) for pair in pairs) for i in (0, 1))
-    return mine / other if other else 1.0
+    if not other:
+        raise ValueError(
+            f'motion {motion.name!r}: no two joints at the ends of a limb have counterparts; expected, '
+            'for instance, hip and knee in joint_map, or pass scale='
+        )
+    return mine / other
 
 
 def _captured(
@@ -230,6 +275,9 @@ def _poses(
 
     The root has the positions `path`, (n, 3), and the rotations `turns`, (n, 4). Joints follow
     those of a clip, or for a capture the target orientations of links.
+
+    Raises:
+      ValueError: a hinge that is not about the lateral axis follows one of a clip.
     """
     layout, n = figure.layout, len(path)
     poses = np.zeros((n, layout.columns))
@@ -246,15 +294,22 @@ def _poses(
         parent = reached[parents[i]]
         relative = quaternion.multiply(quaternion.conjugate(zero[parents[i]]), zero[i])
         before = quaternion.multiply(parent, relative)
-        turn = np.tile(_IDENTITY, (n, 1))
+        turn, axis = np.tile(_IDENTITY, (n, 1)), axes[i - 1]
         if joint in chosen and links is not None:
             turn = quaternion.multiply(quaternion.conjugate(before), links[i])
         elif joint in chosen:
             assert isinstance(motion, Clip)
-            turn = _turns(motion, chosen[joint])
+            their = chosen[joint]
+            way = _LATERAL if axis is None else quaternion.rotate(zero[i], axis)
+            if motion.sizes[motion.joints.index(their)] == 1 and abs(way @ _LATERAL) < SLANT:
+                raise ValueError(
+                    f'joint_map: the axis of {joint!r} is {way.round(2).tolist()}, but that of {their!r} is '
+                    'taken to be the lateral one, as of all hinges of clips; expected a map without it'
+                )
+            turn = quaternion.multiply(_turns(motion, their), zero[i])
+            turn = quaternion.multiply(quaternion.conjugate(zero[i]), turn)
         column, _ = layout.starts(joint)
         if size == 1:
-            axis = axes[i - 1]
             if axis is None:  # slides stay at 0
                 turn = np.tile(_IDENTITY, (n, 1))
             else:
@@ -269,7 +324,7 @@ def _poses(
 
 
 def _turns(motion: Clip, joint: str) -> np.ndarray:
-    """Returns the rotations of a clip's joint relative to its parent, (n, 4)."""
+    """Returns the rotations of a clip's joint from its zero pose, in the root's axes, (n, 4)."""
     column, _ = motion.layout.starts(joint)
     if motion.sizes[motion.joints.index(joint)] == 4:
         return motion.poses[:, column : column + 4]
