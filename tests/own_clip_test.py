@@ -559,6 +559,13 @@ class CycleTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'loops already'):
             retargeting.cycle(found)
 
+    def test_a_cycle_may_end_with_the_clip(self):
+        """Of which only the last 28/30 s are a cycle; its rounded end is later than the clip's."""
+        t = np.arange(41) / 30
+        knee = np.where(t < 0.39, 9 * (t - 0.4), np.sin(2 * np.pi * (t - 0.4) * 30 / 28))
+        clip = motion.Clip('c', t, np.c_[t, 1 + 0 * t, 0 * t, knee], 'planar', ('knee',), (1,))
+        self.assertAlmostEqual(retargeting.cycle(clip).duration, 28 / 30)
+
     def test_a_somersault_stays_one(self):
         t = np.linspace(0, 3, 91)
         poses = np.stack([t, 1 + 0.1 * np.sin(2 * np.pi * t), 2 * np.pi * t], 1)
@@ -607,8 +614,9 @@ class CheckTest(parameterized.TestCase):
             (retargeting.retarget, dataclasses.replace(walk, poses=walk.poses - 2 * np.eye(1, walk.poses.shape[1], 1)), 'raptor', 'median height of its root is -1.* expected more than 0, or pass scale='),
             (retargeting.retarget, walk, 'raptor', {'root': 'left_knee', 'left_knee': 'left_knee'}, "'root' follows 'left_knee' of clip"),
             (retargeting.retarget, walk, 'raptor', {'root': 'root', 'left_knee': 'root'}, "'left_knee' follows 'root' of clip .*; expected the root"),
+            *((clip_check.check, walk, 'biped2d', near, f'near is {near}; expected a number above 0, in m') for near in (np.nan, 0, -1)),
             (retargeting.retarget, walk, 'raptor', None, 0, 'scale is 0'), (retargeting.cycle, walk, 0.1, 'both or none'),
-            (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1 s'), (retargeting.cycle, short, 'lasts 0.2 s'),
+            (retargeting.cycle, walk, 0.5, 3.0, 'expected 0 <= start < end <= 1.0 s'), (retargeting.cycle, short, 'lasts 0.2 s'),
             (motion.read_bvh, __file__, 0.01, 'w', "forward is 'w'"),
             (motion.read_bvh, __file__, 0.01, '-y', 'expected two axes'),
         )))  # fmt: skip
@@ -644,12 +652,26 @@ class CheckTest(parameterized.TestCase):
         clip = motion.load('biped2d_walk')
         poses = clip.poses.copy()
         poses[:, 0] = 0
-        report = clip_check.check(dataclasses.replace(clip, poses=poses), 'biped2d')
+        report = clip_check.check(dataclasses.replace(clip, poses=poses, loop=False), 'biped2d')
         self.assertEqual({fault.kind for fault in report.faults}, {'foot slide'})
         self.assertBetween(max(fault.amount for fault in report.faults), 0.4, 1.5)
         first = report.faults[0]
         self.assertAlmostEqual(first.amount, 0.02, delta=0.02)  # not before it has travelled so far
         self.assertIn('foot slide', str(report))
+
+    def test_a_contact_lasts_across_the_seam(self):
+        """Of a figure that stands, and is pulled by 15 mm per cycle."""
+        stands = KinematicViewer('biped2d')
+        poses = np.tile(stands.standing(), (16, 1))
+        poses[:, 0], layout = 0.001 * np.arange(16), stands.layout
+        clip = motion.Clip(
+            'pulled', np.arange(16) / 15, poses, 'planar', layout.joints, layout.sizes
+        )
+        self.assertEmpty(clip_check.check(clip, 'biped2d').faults)
+        report = clip_check.check(dataclasses.replace(clip, loop=True), 'biped2d')
+        for foot in ('right_ankle', 'left_ankle'):
+            np.testing.assert_allclose(report.slide[foot], 0.001 * np.arange(15, 31), atol=1e-9)
+        self.assertEqual({fault.frame for fault in report.faults}, set(range(6, 16)))
 
 
 class ImitationTest(FolderTest):

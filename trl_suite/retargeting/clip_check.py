@@ -20,6 +20,7 @@ from trl_suite import characters
 from trl_suite.motion import Clip, quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import tables
+from trl_suite.util.options import checked
 
 # Thresholds of faults. Shipped clips have no faults, see mocap/README.md.
 EXCESS = 1e-3  # rad beyond a joint's limits (m for a slide)
@@ -89,14 +90,18 @@ class Report:
 def check(clip: Clip, character: str | characters.CharacterSpec, near: float = NEAR) -> Report:
     """Checks a clip on level ground at height 0, at its key frames.
 
+    Contacts of a looping clip last across its seam, as those of a clip of two cycles.
+
     Args:
       clip: a clip with the joints of the character.
       character: name or `CharacterSpec`.
-      near: height below which a corner of a foot is in contact, m. Feet are the end effectors.
+      near: height below which a corner of a foot is in contact, m, positive. Feet are the end
+        effectors.
 
     Raises:
-      ValueError: an unknown character, or a clip with other joints.
+      ValueError: an unknown character, a clip with other joints, or another height.
     """
+    checked('near', near, float, 'm', above=0)
     figure = KinematicViewer(character)
     layout, own = figure.layout, clip.layout
     if (own.root, own.joints, own.sizes) != (layout.root, layout.joints, layout.sizes):
@@ -104,18 +109,20 @@ def check(clip: Clip, character: str | characters.CharacterSpec, near: float = N
             f'clip {clip.name!r} (root {own.root}, joints {", ".join(own.joints)}) does not fit '
             f'{figure.character.spec.name!r} (root {layout.root}, joints {", ".join(layout.joints)})'
         )
-    corners = np.empty((len(clip.times), len(figure.links), 8, 3))
-    for i, pose in enumerate(clip.poses):
+    before = clip.pose(clip.times[:-1] - clip.duration) if clip.loop else clip.poses[:0]
+    corners = np.empty((len(before) + len(clip.times), len(figure.links), 8, 3))
+    for i, pose in enumerate(np.concatenate([before, clip.poses])):
         figure.put(pose)
         corners[i] = figure.corners()
+    slide = {
+        foot: _slide(corners[:, [name == foot for name in figure.links]], near)[len(before) :]
+        for foot in figure.character.spec.end_effectors
+    }
+    corners = corners[len(before) :]
     deep = np.maximum(0.0, -corners[..., 2].min(2))
     depth: dict[str, np.ndarray] = {}
     for name, values in zip(figure.links, deep.T, strict=True):
         depth[name] = np.maximum(values, depth.get(name, 0.0))
-    slide = {
-        foot: _slide(corners[:, [name == foot for name in figure.links]], near)
-        for foot in figure.character.spec.end_effectors
-    }
     units = dict(
         zip(layout.joints, np.where(figure.character.prismatic, 'm', 'rad').tolist(), strict=True)
     )

@@ -36,7 +36,7 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
         start, end = _alike(clip)
     if not 0 <= start < end <= clip.duration:
         raise ValueError(
-            f'start and end are {start} and {end}; expected 0 <= start < end <= {clip.duration:.4g} s'
+            f'start and end are {start} and {end}; expected 0 <= start < end <= {clip.duration} s'
         )
     step = float(np.median(np.diff(clip.times)))
     share = np.linspace(0, 1, max(3, round((end - start) / step) + 1))
@@ -61,7 +61,7 @@ def _alike(clip: Clip) -> tuple[float, float]:
     """Returns the two times of a clip with the most similar poses and velocities, s."""
     if clip.duration < CYCLE[0]:
         raise ValueError(
-            f'clip {clip.name!r} lasts {clip.duration:.3g} s; expected at least {CYCLE[0]} s, or the '
+            f'clip {clip.name!r} lasts {clip.duration} s; expected at least {CYCLE[0]} s, or the '
             'times of the cycle'
         )
     frame = float(np.median(np.diff(clip.times)))
@@ -74,6 +74,7 @@ def _alike(clip: Clip) -> tuple[float, float]:
         found = (np.inf, 0.0, 0.0)
         for start in starts:
             times = start + np.append(0, lengths[start + lengths <= clip.duration + 1e-9])
+            times = np.minimum(times, clip.duration)  # after it, a clip does not move
             poses, rates = clip.pose(times), RATE_TIME * clip.velocity(times)
             change = _change(clip, np.broadcast_to(poses[0], poses[1:].shape), poses[1:])
             difference = (change[:, flat:] ** 2).sum(1) + ((rates[1:] - rates[0]) ** 2).sum(1)
