@@ -7,6 +7,7 @@ import re
 from unittest import mock
 
 import numpy as np
+import own_clip_test
 import own_test
 from absl.testing import parameterized
 from helpers import write_terrainrl
@@ -272,6 +273,27 @@ class ClipTest(CommandTest):
         self.assertIn('joints without a counterpart: right_hip', out)
         self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
         self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
+
+    def test_options_of_captures(self):
+        """A walk at 24 frames per second, in a file without units and with the figure facing z."""
+        walk = motion.load('biped3d_mocap_walk')
+        figure = own_clip_test.Figure('biped3d_mocap', walk, 25)
+        own_clip_test.write_acclaim(figure, self.folder / 'a.asf', self.folder / 'a.amc')
+        arguments = 'clip', 'a.amc', '--skeleton', 'a.asf', '--character', 'biped2d', '--scale', '1'
+        ways = []
+        for *options, duration in (
+            (0.2,), ('--rate', '24', 1.0), ('--rate', '24', '--unit', '0.0508', 1.0),
+            ('--rate', '24', '--forward=-z', 1.0),
+        ):  # fmt: skip
+            self.output(*arguments, *options, '--output', 'a.npz')
+            found = motion.load('a.npz')
+            self.assertAlmostEqual(found.duration, duration)
+            ways.append(found.displacement[0])
+        self.assertGreater(ways[0], 1)
+        np.testing.assert_allclose(np.divide(ways, ways[0]), [1, 1, 2, -1], atol=1e-6)
+        self.assert_refused("forward is 'z' and up '-z'; expected two axes", *arguments, '--up=-z')
+        run_json = 'clip', 'run.json', '--character', 'raptor'
+        self.assert_refused("option of .json files 'rate'; known: none", *run_json, '--rate', '60')
 
     def test_invalid_maps_are_rejected(self):
         for text, message in (

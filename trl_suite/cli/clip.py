@@ -20,6 +20,16 @@ def declare(commands: Any) -> None:
     command.add_argument('file', metavar='FILE', type=pathlib.Path, help=text)
     command.add_argument('--character', required=True, help='name of a character')
     add_file(command, '--skeleton', 'the .asf file of an .amc file')
+    text = 'frames per second of an .amc file, which does not state them; by default 120'
+    command.add_argument('--rate', type=float, help=text)
+    text = 'unit of lengths in m, by default 0.01 of BVH and 0.0254 (an inch) of .amc files'
+    command.add_argument('--unit', type=float, metavar='M', help=text)
+    for name, axis in (
+        ('--forward', 'that the rest pose faces, by default z'),
+        ('--up', 'that points up, by default y'),
+    ):
+        text = f'axis of a BVH or .amc file {axis}; a negative one as {name}=-x'
+        command.add_argument(name, metavar='AXIS', help=text)
     text = (
         "a .json that maps the character's joints to the motion's; by default usual names are tried"
     )
@@ -47,7 +57,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.map is not None:
         chosen = _joint_map(arguments.map)
     name = arguments.character
-    motion = retargeting.read(arguments.file, name, arguments.skeleton)
+    given = {option: getattr(arguments, option) for option in ('rate', 'unit', 'forward', 'up')}
+    options = {option: value for option, value in given.items() if value is not None}
+    motion = retargeting.read(arguments.file, name, arguments.skeleton, **options)
     clip = retargeting.retarget(motion, name, chosen, arguments.scale)
     if clip is not motion:
         joints = KinematicViewer(name).layout.joints
