@@ -690,6 +690,20 @@ class ImitationTest(FolderTest):
         time_step = environment.step(environment.task.clip_action(0))
         self.assertGreater(time_step.reward, 0.5)
 
+    def test_action_0_of_own_characters_is_the_mean_of_the_clip(self):
+        """Right and left by name need not be mirror images: these legs are spread at the hips."""
+        spec, t = legs(self.folder, '1 0 0'), np.linspace(0, 1, 31)
+        spread = 0.1 * np.cos(2 * np.pi * t) + 0.2
+        clip = free(
+            t,
+            np.c_[t, 0 * t, 0.6 + 0 * t],
+            Rotation.identity(31),
+            right_hip=-spread,
+            left_hip=spread,
+        )
+        environment = suite.build(spec, clip=dataclasses.replace(clip, loop=True), terrain='plane')
+        np.testing.assert_allclose(environment.action_map.action_offset, [-0.2, 0.2], atol=1e-6)
+
     def test_example_runs(self):
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 61)
         write_bvh(figure, self.folder / 'walk.bvh')

@@ -280,18 +280,20 @@ def _extents(
     return np.stack([centre[..., 0], half[..., 0], centre[..., 1] - half[..., 2]], axis=-2)
 
 
-def mean_targets(poses: np.ndarray, motion: Clip | FootstepLibrary) -> np.ndarray:
-    """Returns the mean target of every degree of freedom over poses and their mirror images.
+def mean_targets(poses: np.ndarray, motion: Clip | FootstepLibrary, symmetric: bool) -> np.ndarray:
+    """Returns the mean target of every degree of freedom over poses.
 
     Args:
-      poses: poses of a spatial motion, (k, columns of a pose).
+      poses: poses of a motion, (k, columns of a pose).
       motion: motion with the layout of these poses.
+      symmetric: whether mirror images of the poses count too; for spatial characters with pairs of joints.
 
     Returns:
       Rotation vectors of ball joints in rad, angles of hinges, in link order.
     """
-    both = np.concatenate([poses, motion.layout.mirror.pose(poses)])
-    return joint_targets(motion, both).mean(0)
+    if symmetric:
+        poses = np.concatenate([poses, motion.layout.mirror.pose(poses)])
+    return joint_targets(motion, poses).mean(0)
 
 
 def joint_targets(motion: Clip | FootstepLibrary, poses: np.ndarray) -> np.ndarray:

@@ -200,6 +200,9 @@ class Clip:
     def mirrored(self, pairs: Iterable[tuple[str, str]] | None = None) -> Clip:
         """Returns the clip with left and right exchanged; see `Mirror`.
 
+        For characters whose hinges are about the lateral axis, as those of the suite; other hinges,
+        such as roll and yaw joints of robots, would have to change their sign, and do not.
+
         Args:
           pairs: names of joints to swap, (right, left) in either order. Other joints keep their
             columns. By default the joints named `right_...` and `left_...`.

@@ -12,7 +12,7 @@ import numpy as np
 from trl_suite.actuation import character_muscles
 from trl_suite.actuation.models import original_ranges
 from trl_suite.actuation.muscles import PLAIN, Muscle
-from trl_suite.bodies.reference import joint_targets, mean_targets
+from trl_suite.bodies.reference import mean_targets
 from trl_suite.bodies.spatial import MAPS
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, FootstepLibrary
@@ -232,11 +232,11 @@ def joint_options(
         options = {'rotations': 'angle_axis'} if character.spec.spatial else _original(character)
     elif model == 'position':
         options = {} if scale is None else {'action_scale': scale}
-        if offset == 'clip' and motion is not None and character.spec.spatial:
-            options = {'action_scale': ACTION_SCALE, **options}
-            options['action_offset'] = mean_targets(typical, motion)
-        elif offset == 'clip' and motion is not None:
-            options['action_offset'] = joint_targets(motion, typical).mean(0)
+        if offset == 'clip' and motion is not None:
+            spatial = character.spec.spatial
+            options = {'action_scale': ACTION_SCALE, **options} if spatial else options
+            symmetric = spatial and bool(character.spec.mirror)
+            options['action_offset'] = mean_targets(typical, motion, symmetric)
     return options, ()
 
 
