@@ -12,7 +12,8 @@ observation.
 Writes the best of the three policies to `trained/generalist/ID.npz`, where ID is the character's
 environment of mixed terrain, makes it the policy of the other terrains, too, in
 `trained/generalist/shared.json`, and writes settings, learning curve, and evaluations of specialists,
-distilled, trained and averaged policy to `ID.json`.
+distilled, trained and averaged policy to `ID.json`; specialists and the best policy are evaluated again in
+episodes that had no part in its choice.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from continual import distil
 from networks import mean_of, trimmed
 from settings import settings_for
 from several import Several
-from train_all import SEED
+from train_all import OTHER_SEED, SEED
 
 from trl_suite import evaluation, policies
 from trl_suite.util.digest import digest
@@ -90,9 +91,11 @@ def ids_of(character: str) -> list[str]:
     return [f'PD_{CHARACTERS[character]}_{ground}_Terrain-v0' for ground in GROUNDS]
 
 
-def evaluated(ids: list[str], make: Any, episodes: int) -> dict[str, dict[str, Any]]:
-    """Evaluates the policy `make(id)` in each environment."""
-    results = evaluation.evaluate_all([(id_, make(id_)) for id_ in ids], episodes, SEED, 1)
+def evaluated(
+    chosen: dict[str, policies.Policy], episodes: int, seed: int = SEED
+) -> dict[str, dict[str, Any]]:
+    """Evaluates in each environment the policy that is chosen for it."""
+    results = evaluation.evaluate_all(list(chosen.items()), episodes, seed, 1)
     return {r['id']: {key: r[key] for key in RESULTS} for r in results}
 
 
@@ -102,17 +105,17 @@ def mean_score(results: dict[str, dict[str, Any]]) -> float:
 
 
 def train(
-    ids: list[str], seed: int, settings: Settings, folder: pathlib.Path
+    specialists: dict[str, policies.Policy], seed: int, settings: Settings, folder: pathlib.Path
 ) -> tuple[policies.Policy, policies.Policy, list[dict[str, Any]]]:
     """Returns the distilled and the trained policy, and the learning curve."""
     torch.set_num_threads(1)
+    ids, experts = list(specialists), list(specialists.values())
     counts = [settings.each * (2 if ground in settings.twice else 1) for ground in GROUNDS]
     own = settings_for(
         ids[-2], **settings.ppo, cloning_epochs=settings.epochs, num_envs=sum(counts)
     )
     trainer = ppo.Trainer(ids[-2], seed, own, 1)
     trainer.environments.close()
-    experts = [policies.reference(id_) for id_ in ids]
     log_std = np.mean([expert.log_std for expert in experts], axis=0)
     trainer.log_std.data.copy_(torch.from_numpy(log_std.astype(np.float32)))
     seeds = np.random.SeedSequence(seed).generate_state(len(ids))
@@ -167,18 +170,23 @@ def main() -> None:
             settings = dataclasses.replace(settings, ppo=own)
         ids, folder = ids_of(character), arguments.runs / character
         begin = time.monotonic()
+        specialists = {id_: policies.reference(id_) for id_ in ids}
         with runs.only_run(folder):
-            distilled, policy, curve = train(ids, arguments.seed, settings, folder)
+            distilled, policy, curve = train(specialists, arguments.seed, settings, folder)
         averaged = mean_of([distilled, policy])
         found = {'distilled': distilled, 'trained': policy, 'averaged': averaged}
         made = {kind: trimmed(each) for kind, each in found.items()}
-        results = {kind: evaluated(ids, lambda _, p=p: p, EPISODES) for kind, p in made.items()}
+        results = {kind: evaluated(dict.fromkeys(ids, p), EPISODES) for kind, p in made.items()}
         best = max(made, key=lambda kind: mean_score(results[kind]))
         entry = {
             'ids': ids, 'seed': arguments.seed, 'settings': dataclasses.asdict(settings),
             'machine': runs.machine(),
             'seconds': round(time.monotonic() - begin), 'curve': curve,
-            'specialists': evaluated(ids, policies.reference, EPISODES), **results, 'shipped': best,
+            'distilled_from': {id_: digest(each) for id_, each in specialists.items()},
+            'specialists': evaluated(specialists, EPISODES), **results, 'shipped': best,
+            # In episodes that had no part in the choice.
+            'specialists_again': evaluated(specialists, EPISODES, OTHER_SEED),
+            'shipped_again': evaluated(dict.fromkeys(ids, made[best]), EPISODES, OTHER_SEED),
         }  # fmt: skip
         enter(ids, made[best], entry)
         for id_ in ids:

@@ -10,7 +10,8 @@ its mean distance is not below the interval of the default gait. Of several pref
 gait (`Policy.with_preference`) the best one is used, measured with another seed.
 
 Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
-environment in which it was trained; `preference`, if it is not 0; and `evaluation`, its results.
+environment in which it was trained; `preference`, if it is not 0; `evaluation`, its results; and
+`shipped_again`, those in episodes that had no part in the choice.
 """
 
 from __future__ import annotations
@@ -97,8 +98,13 @@ def main() -> None:
         low, high = before['distance_interval']
         if found['distance'] <= (high if has_policy else low):
             continue
-        entry = {'policy': of, **({'preference': preference} if preference else {})}
-        runs.enter(policies.SHARED, id_, {**entry, 'evaluation': found})
+        entry = {
+            'policy': of, **({'preference': preference} if preference else {}), 'evaluation': found,
+            'shipped_again': evaluation.evaluate(
+                id_, policy, arguments.episodes, train_all.OTHER_SEED, arguments.threads
+            ),
+        }  # fmt: skip
+        runs.enter(policies.SHARED, id_, entry)
         with runs.changing(policies.SHARED) as shared:  # no other process changes it meanwhile
             remove_unused(shared)
 

@@ -54,7 +54,7 @@ from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
 EPISODES, SEED = 50, 0  # of the published evaluation
-# Of its repetition in other episodes, if the best of several seeds is shipped; no run has these.
+# Of its repetition in episodes that had no part in the choice of a policy; no run has these.
 OTHER_SEED = runs.EVALUATION_SEED + 3
 GAIT_EPISODES = 200  # the standard deviation of the distance before a fall is as large as its mean
 SEEDS = (1,)
@@ -105,6 +105,11 @@ def start_of(id_: str) -> str | None:
     """Returns the initial policy of the training of an environment, if any."""
     own = program(id_).settings_for(id_)
     return getattr(own, 'start', '') or getattr(getattr(own, 'first', own), 'start', None)
+
+
+def episodes_of(id_: str) -> int:
+    """Returns the number of episodes in which the policies of an environment are evaluated."""
+    return GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
 
 
 def needed(id_: str) -> list[str]:
@@ -265,8 +270,7 @@ def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     imitates = settings.get('cloned', 0) >= settings['samples']
     name = 'last' if settings.get('stages') or imitates else 'policy'
     policy = trimmed(policies.load(folder / f'{name}.npz'))
-    episodes = GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
-    found = evaluation.evaluate(id_, policy, episodes, SEED, num_threads=1)
+    found = evaluation.evaluate(id_, policy, episodes_of(id_), SEED, num_threads=1)
     entry = {
         **curve,
         'machine': machine or runs.machine(),
@@ -282,9 +286,9 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
     A run with other settings than those that are entered replaces them, if its score is higher or with
     `overwrite`.
 
-    Of several seeds the best one is chosen in the episodes of `evaluation`; a mean over seeds is not
-    affected by the choice, but the evaluation of the chosen one is, so it is evaluated once more in
-    episodes that had no part in it.
+    The best one, of seeds and of settings, is chosen in the episodes of `evaluation`; a mean over seeds
+    is not affected by the choice, but the evaluation of the chosen one is, so it is evaluated once
+    more in episodes that had no part in it.
     """
     own, score = run.entry, TASK_TYPES[catalogue.BY_ID[id_].task_type].score
     path = runs.place(f'{id_}.npz')
@@ -303,13 +307,12 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
         if best is not own and stored.get('shipped') == seed:
             every, best = [own], own  # the policy that is replaced is the only one that is stored
         policy = run.policy if best is own else policies.load(path)
-        entry = {'id': id_, 'shipped': best['seed'], 'of': digest(policy), 'runs': every}
-        if len(every) > 1:
-            entry['shipped_again'] = evaluation.evaluate(
-                id_, policy, EPISODES, OTHER_SEED, num_threads=1
-            )
+        again = evaluation.evaluate(id_, policy, episodes_of(id_), OTHER_SEED, num_threads=1)
         stored.clear()
-        stored.update(entry)
+        stored.update({
+            'id': id_, 'shipped': best['seed'], 'of': digest(policy), 'runs': every,
+            'shipped_again': again,
+        })  # fmt: skip
         if best is own:  # last, since both files are written together
             policies.save(policy, path)
     with runs.changing(policies.SHARED) as used:

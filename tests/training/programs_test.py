@@ -310,7 +310,10 @@ class JobsTest(FolderTest):
         (self.folder / policies.SHARED).write_text(json.dumps({id_: entry}))
         entry = {'seed': 1, 'settings': {}, 'evaluation': {'distance': returned}}
         run = train_all.Run(entry, policies.reference(id_), 'here', 1.0)
-        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(evaluation, 'evaluate', return_value={}),
+        ):
             train_all.enter(id_, 1, run)
             self.assertEqual(policies.trained_for(id_), id_ if better else other)
             self.assertIn(id_, policies.available())
@@ -327,7 +330,10 @@ class JobsTest(FolderTest):
             out = output(lambda: train_all.enter(id_, seed, run, **options))
             return policies.load(self.folder / f'{id_}.npz').info['samples'], out
 
-        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)):
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(evaluation, 'evaluate', return_value={}),
+        ):
             self.assertEqual(enter(2e6, 100.0), (2e6, ''))
             shipped, out = enter(100.0, 3.0)
             self.assertEqual(shipped, 2e6)
@@ -356,6 +362,29 @@ class JobsTest(FolderTest):
                 named = train_all.shipped(stored)['evaluation']['distance']
                 self.assertEqual((own.info['m'], digest(own)), (named, stored['of']))
             self.assertEqual((named, len(stored['runs'])), (85, 3))
+
+    def test_what_is_chosen_is_evaluated_again_in_other_episodes(self):
+        id_, of = 'FSM_Dog2D_Terrain_Gaps-v0', 'FSM_Dog2D_Terrain_Mixed-v0'
+        policy = policies.reference(of)
+        again = {'seed': train_all.OTHER_SEED, 'episodes': train_all.GAIT_EPISODES}
+
+        def evaluate(id_, policy, episodes, seed, *options, factory=False, **more):
+            distance = 100.0 - 90 * factory
+            return {
+                'seed': seed, 'episodes': episodes, 'distance': distance,
+                'median_distance': distance, 'distance_interval': [distance] * 2,
+            }  # fmt: skip
+
+        with (
+            mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(self.folder)),
+            mock.patch.object(evaluation, 'evaluate', evaluate),
+        ):
+            entry = {'seed': 1, 'settings': {}, 'evaluation': {'distance': 9.0}}
+            train_all.enter(of, 1, train_all.Run(entry, policy, '', 1.0))
+            output(share_gaits.main, of, id_)
+            for found in (runs.read(f'{of}.json'), runs.read(policies.SHARED)[id_]):
+                self.assertEqual(found['shipped_again'] | again, found['shipped_again'])
+            self.assertEqual(runs.read(policies.SHARED)[id_]['evaluation']['seed'], train_all.SEED)
 
     def test_a_policy_that_others_use_is_kept(self):
         for id_ in 'abcd':
@@ -450,7 +479,8 @@ class GeneralistTest(FolderTest):
         }  # fmt: skip
         short = dataclasses.replace(short, ppo=ppo_)
         with contextlib.redirect_stderr(io.StringIO()):
-            distilled, policy, curve = generalist.train(ids, 0, short, self.folder)
+            specialists = {id_: policies.reference(id_) for id_ in ids}
+            distilled, policy, curve = generalist.train(specialists, 0, short, self.folder)
         self.assertEqual(policy.id, 'PD_Biped2D_Mixed_Terrain-v0')
         self.assertNotEmpty(curve)
         observation = VectorEnvironment(ids[0], 8, 1, 0).reset()
@@ -468,6 +498,39 @@ class GeneralistTest(FolderTest):
             self.assertEqual(policies.reference(ids[0], 'generalist').id, ids[0])
             entry = runs.read(f'generalist/{ids[-2]}.json')
             self.assertEqual(entry, {'ids': ids, 'of': digest(policy)})
+
+    def test_the_best_is_evaluated_again_in_other_episodes(self):
+        ids, entries = generalist.ids_of('biped2d'), []
+        specialist = policies.reference(ids[-2])
+        best = dataclasses.replace(specialist, clip=specialist.clip + 1)
+
+        def evaluate(pairs, episodes, seed, threads):
+            return [
+                {
+                    **dict.fromkeys(generalist.RESULTS, 0), 'id': id_, 'seed': seed,
+                    'completion_rate': 1.0, 'normalized_return': float(policy.clip == best.clip),
+                }
+                for id_, policy in pairs
+            ]  # fmt: skip
+
+        with (
+            mock.patch.object(generalist, 'train', lambda *_: (specialist, best, [])),
+            mock.patch.object(generalist, 'mean_of', lambda _: specialist),
+            mock.patch.object(evaluation, 'evaluate_all', evaluate),
+            mock.patch.object(generalist, 'enter', lambda *given: entries.append(given[-1])),
+        ):
+            output(generalist.main, 'biped2d', '--runs', self.folder)
+        [entry] = entries
+        self.assertEqual(entry['shipped'], 'trained')
+        for kind, seed, score in (
+            ('trained', generalist.SEED, 1),
+            ('shipped_again', train_all.OTHER_SEED, 1),
+            ('specialists_again', train_all.OTHER_SEED, 0),
+        ):
+            for found in entry[kind].values():
+                self.assertEqual((found['seed'], found['normalized_return']), (seed, score), kind)
+        self.assertEqual(list(entry['distilled_from']), ids)
+        self.assertEqual(entry['distilled_from'][ids[-2]], digest(specialist))
 
     @parameterized.parameters(*generalist.CHARACTERS)
     def test_what_is_shipped_has_the_results_of_its_file(self, character):
