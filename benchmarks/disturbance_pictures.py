@@ -80,7 +80,8 @@ def draw_worlds(path: pathlib.Path) -> None:
         axis.set_xlabel('time (s)')
     for axis in axes[:, 0]:
         axis.set_ylabel('distance (m)')
-    figure.savefig(path, dpi=90)
+    with files.replacing(path) as part:
+        figure.savefig(part, dpi=90)
 
 
 def draw_sensors(path: pathlib.Path) -> None:
@@ -103,7 +104,8 @@ def draw_sensors(path: pathlib.Path) -> None:
         axis.set_xlabel('position ahead (m)')
     axes[0].set_ylabel('height (m)')
     axes[0].legend()
-    figure.savefig(path, dpi=90)
+    with files.replacing(path) as part:
+        figure.savefig(part, dpi=90)
 
 
 def draw_push(path: pathlib.Path) -> None:
@@ -141,7 +143,8 @@ def draw_randomized(path: pathlib.Path) -> None:
         axis.set_xlabel('samples (M)')
     for axis in axes[:, 0]:
         axis.set_ylabel('return with the preset')
-    figure.savefig(path, dpi=90)
+    with files.replacing(path) as part:
+        figure.savefig(part, dpi=90)
 
 
 PICTURES = {

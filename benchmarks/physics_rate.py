@@ -563,7 +563,8 @@ def plot(figures, file):
     figure.legend(handles, labels, loc='lower center', ncols=5, fontsize=8, frameon=False)
     figure.suptitle('Physics rate; grey: the default, dotted: what is accepted')
     figure.tight_layout(rect=(0, 0.1, 1, 1))
-    figure.savefig(file, dpi=90)
+    with files.replacing(file) as part:
+        figure.savefig(part, dpi=90)
 
 
 def main():

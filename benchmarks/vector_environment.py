@@ -157,7 +157,8 @@ def plot(figures, path):
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc='center left', bbox_to_anchor=(1.01, 0.5))
     figure.tight_layout()
-    figure.savefig(path, dpi=100)
+    with files.replacing(path) as part:
+        figure.savefig(part, dpi=100)
 
 
 def main():

@@ -16,7 +16,7 @@ import io
 import pathlib
 import platform
 import re
-import shutil
+import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -28,7 +28,8 @@ from trl_suite.util import files, resources
 from trl_suite.util.machine import cores
 from trl_suite.util.options import checked
 
-WRITTEN = 'checkpoint.pt', 'curve.json', 'policy.npz', 'first', '.lock'  # in the folder of a run
+# In the folder of a run; an interrupted one may have only some of them.
+WRITTEN = 'checkpoint.pt', 'curve.json', 'policy.npz', 'first', 'run_1', 'log.txt', '.lock'
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
 # Of files with results: one line, since they have long lists; settings may be infinite.
 FORM: dict[str, Any] = {'indent': None, 'allow_nan': True}
@@ -188,8 +189,11 @@ def remove(folder: pathlib.Path) -> None:
         return
     if any(folder.iterdir()) and not any((folder / name).exists() for name in WRITTEN):
         raise FileExistsError(f'{folder}: is not the folder of a run; remove it, or choose another')
-    with only_run(folder):
-        shutil.rmtree(folder)
+    outer = tempfile.TemporaryDirectory(
+        prefix=f'.{folder.name}.', suffix='.part', dir=folder.parent, ignore_cleanup_errors=True
+    )
+    with only_run(folder), outer as aside:  # a killed process leaves a whole run, or none
+        folder.rename(pathlib.Path(aside, folder.name))
 
 
 # Results in `trained/`, or in the folder TRL_SUITE_TRAINED.

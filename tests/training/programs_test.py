@@ -883,10 +883,25 @@ class ProgramsTest(FolderTest):
         (self.folder / 'thesis.txt').write_text('mine')
         with self.assertRaisesRegex(FileExistsError, 'is not the folder of a run'):
             runs.remove(self.folder)
+        for name in ('curve.json', 'log.txt', 'run_1/checkpoint.pt'):  # of interrupted ones, too
+            (self.folder / 'run' / name).parent.mkdir(parents=True)
+            (self.folder / 'run' / name).touch()
+            runs.remove(self.folder / 'run')
+            self.assert_only('thesis.txt')
         (self.folder / 'run').mkdir()
-        (self.folder / 'run/curve.json').write_text('{}')
-        runs.remove(self.folder / 'run')
-        self.assertEqual([path.name for path in self.folder.iterdir()], ['thesis.txt'])
+        (self.folder / 'run/curve.json').touch()
+        found = []  # when files begin to be removed
+
+        def stop(*_, **__):
+            found.extend(path.name for path in self.folder.iterdir())
+            raise KeyboardInterrupt
+
+        with (
+            mock.patch.object(runs.tempfile.TemporaryDirectory, 'cleanup', stop),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            runs.remove(self.folder / 'run')
+        self.assertNotIn('run', found)
 
     def test_every_program_ends_errors_in_one_line(self):
         folder = pathlib.Path(ppo.__file__).parent
