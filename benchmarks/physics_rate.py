@@ -571,7 +571,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--quick', action='store_true', help='few starts, as a test of the program')
     parser.add_argument('--json', type=pathlib.Path, help='write the figures to this file')
-    parser.add_argument('--plot', help='plot the figures to this file')
+    parser.add_argument('--plot', type=pathlib.Path, help='plot the figures to this file')
     parser.add_argument(
         '--page', type=pathlib.Path, help='only write the tables of --json into this page'
     )

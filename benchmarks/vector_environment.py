@@ -165,7 +165,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
     parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
-    parser.add_argument('--plot', help='also plot rate against number of simulations')
+    parser.add_argument(
+        '--plot', type=pathlib.Path, help='also plot rate against number of simulations'
+    )
     parser.add_argument('--num-envs', type=int, nargs='*', default=SIZES)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
