@@ -33,6 +33,7 @@ import numpy as np
 import pages
 import ppo
 import refine_gaits
+import runs
 import settings
 import torch
 import tqdm
@@ -43,7 +44,7 @@ from trl_suite.util import files, tables
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 
-SEED = 0  # of evaluations
+SEED = runs.TEST_SEED  # of evaluations
 Results = dict[str, Any]  # 'CELL/SEED' -> result
 
 
@@ -339,6 +340,7 @@ def main() -> None:
     samples = compared.samples if arguments.samples is None else arguments.samples
     checked('--samples', samples, float, above=0)
     checked('--seeds', arguments.seeds, list[int], at_least=0)
+    runs.check_seeds('--seeds', *arguments.seeds)
     path = arguments.json or arguments.runs / f'{name}.json'
     start: dict[str, Any] = {'samples': samples, 'results': {}}
     with files.changing(path, start) as found:

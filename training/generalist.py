@@ -163,6 +163,7 @@ def main() -> None:
         '--samples', type=float, help='control steps of PPO, instead of the default'
     )
     arguments = parser.parse_args()
+    runs.check_seeds('--seed', arguments.seed)
     for character in arguments.characters:
         settings = SETTINGS[character]
         if arguments.samples is not None:

@@ -30,6 +30,7 @@ from trl_suite.util.options import checked
 
 # In the folder of a run; an interrupted one may have only some of them.
 WRITTEN = 'checkpoint.pt', 'curve.json', 'policy.npz', 'first', 'run_1', 'log.txt', '.lock'
+TEST_SEED = 0  # of published results
 EVALUATION_SEED = 2**31  # of learning curves; used neither for training nor for published results
 # Of files with results: one line, since they have long lists; settings may be infinite.
 FORM: dict[str, Any] = {'indent': None, 'allow_nan': True}
@@ -71,6 +72,12 @@ def command_line(
     given = {name: getattr(chosen, name) for name in ('samples', *(further or ()))}
     changes = {name: value for name, value in given.items() if value is not None}
     return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
+
+
+def check_seeds(option: str, *seeds: int) -> None:
+    """Refuses to train with the seed of published results, which draws the same starts and terrains."""
+    if TEST_SEED in seeds:
+        raise ValueError(f'{option}: {TEST_SEED} is the seed of the tests; choose another')
 
 
 def passed(before: float, now: float, every: float) -> bool:

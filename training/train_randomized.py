@@ -118,6 +118,7 @@ def main() -> None:
     parser.add_argument('--overwrite', action='store_true', help='repeat runs that are entered')
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
+    runs.check_seeds('--seed', arguments.seed)
     errors.check_known('environment', RANDOMIZED, *arguments.ids)
     for id_ in tqdm.tqdm(arguments.ids, unit='run'):
         if arguments.overwrite:

@@ -61,6 +61,7 @@ def main() -> None:
     parser.add_argument('--enter', action='store_true', help='write results to trained/plans.json')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     arguments = parser.parse_args()
+    runs.check_seeds('--seed', arguments.seed)
     if arguments.each and len(arguments.controllers) < 2:
         raise ValueError('--each has one controller; expected at least two, or no --each')
     id_, ids = suite.find(arguments.id).id, [suite.find(each).id for each in arguments.controllers]

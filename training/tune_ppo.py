@@ -18,6 +18,7 @@ import storage
 from ray import tune
 from ray.tune import schedulers
 from ray.tune.search.basic_variant import BasicVariantGenerator
+from runs import check_seeds
 from settings import settings_for
 
 from trl_suite import suite
@@ -57,13 +58,14 @@ def main(words=None):
     parser.add_argument('id', metavar='ID')
     parser.add_argument('--trials', type=int, default=16)
     parser.add_argument('--samples', type=float, default=4e5, help='control steps of a trial')
-    parser.add_argument('--seed', type=int, default=0, help='of the settings and of every trial')
+    parser.add_argument('--seed', type=int, default=1, help='of the settings and of every trial')
     parser.add_argument('--runs', default='runs/tune', help='folder, or URL of fsspec')
     parser.add_argument('--address', help="of Ray: 'auto', or HOST:PORT")
     chosen = parser.parse_args(words)
     id_ = suite.find(chosen.id).id
     checked('--trials', chosen.trials, int, at_least=1)
     checked('--samples', chosen.samples, float, above=0)
+    check_seeds('--seed', chosen.seed)
     if not ray.is_initialized():
         connect(chosen.address)
     search = BasicVariantGenerator(random_state=chosen.seed)

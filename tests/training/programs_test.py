@@ -920,6 +920,9 @@ class ProgramsTest(FolderTest):
         (train_all, '--runs s3://a/b', "--runs is 's3://a/b'; expected a folder, or a URL with --ray"),
         (compare, 'actions --samples 0', '--samples is 0.0; expected a number above 0'),
         (compare, 'actions --seeds -1', r'--seeds is \[-1\]; expected'),
+        (compare, 'actions --seeds 1 0', '--seeds: 0 is the seed of the tests; choose another'),
+        (generalist, 'dog2d --seed 0', '--seed: 0 is the seed of the tests'),
+        (train_randomized, '--seed 0', '--seed: 0 is the seed of the tests'),
         (evaluate_references, 'transfer Foo', "unknown environment of transfer 'Foo'"),
         (
             evaluate_references, 'default_gaits PD_Biped2D_Flat-v0',
