@@ -30,6 +30,7 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.common.footstep_plan import LEFT, RIGHT
 from trl_suite.util import errors
+from trl_suite.util.digest import digest
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
@@ -158,7 +159,7 @@ def run(
     least, most, leg = np.concatenate(swings, axis=1)
     forwards, to_the_right = np.concatenate(lean).mean(0).tolist()
     return {
-        'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
+        'of': digest(policy), 'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
         'normalized_return': reward / (steps * episodes), 'landing': float(misses.mean()),
         'landing_90': float(np.quantile(misses, 0.9)), 'heading': float(turns.mean()),
         'distance': float(distance.mean()), 'hip_above_knee': float(least.mean()),

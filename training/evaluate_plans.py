@@ -11,7 +11,7 @@ without a fall, in total and in the first minute, speed towards the goal, goals 
 soccer), distance along a trail, the share of time with the ball at its goal, and falls per
 kilometre. `expert` is the expert that policies imitate, for footsteps (not in soccer) or joint targets.
 Environments without hierarchy have no scripted policy; their episodes are as long as the others.
-Writes the results to trained/plans.json.
+Writes the results to trained/plans.json, with the digests of the policy (`of`) and of its footstep controllers.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from trl_suite.cli.arguments import positive
 from trl_suite.registry import catalogue
 from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import errors
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -96,6 +97,8 @@ def run(
         observation, before = step.observation, after
     environments.close()
     return {
+        **({'of': digest(policy)} if isinstance(policy, policies.Policy) else {}),
+        **({'controllers': [digest(each.policy) for each in task.controllers]} if own else {}),
         'episodes': episodes, 'seed': seed, 'reward': float(reward.mean() / limit),
         'survived': float(1 - fell.mean()),
         'survived_minute': float(1 - (fell & (seconds < MINUTE)).mean()), 'seconds': float(seconds.mean()),
@@ -104,6 +107,15 @@ def run(
         'trail': float(np.median(trail)), 'at_goal': float(arrived.sum() / seconds.sum()),
         'falls_per_km': float(1000 * fell.sum() / path.sum()),
     }  # fmt: skip
+
+
+def shown(result: dict[str, Any]) -> dict[str, float]:
+    """Returns the numbers of a result, rounded."""
+    return {
+        name: round(value, 3)
+        for name, value in result.items()
+        if not isinstance(value, (str, list))
+    }
 
 
 def maker(id_: str, name: str) -> Callable[[VectorEnvironment], Any] | None:
@@ -151,7 +163,7 @@ def main() -> None:
             if make is None:
                 continue
             result = run(id_, make, arguments.episodes, arguments.seed, **options)
-            print(id_, name + under, {k: round(v, 3) for k, v in result.items()}, flush=True)
+            print(id_, name + under, shown(result), flush=True)
             runs.add('plans.json', id_, name + under, result)
 
 

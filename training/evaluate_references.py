@@ -20,6 +20,7 @@ from trl_suite import evaluation, policies
 from trl_suite.environments import named_policies
 from trl_suite.registry import catalogue
 from trl_suite.util import errors
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 
@@ -36,7 +37,8 @@ def of_default_gait(id_: str) -> dict[str, Any]:
 
 def of_flat_ground(id_: str) -> dict[str, Any]:
     flat = policies.load(runs.place(f'{flat_ground(catalogue.BY_ID[id_])}.npz'))
-    return evaluation.evaluate(id_, flat, train_all.EPISODES, train_all.SEED)
+    found = evaluation.evaluate(id_, flat, train_all.EPISODES, train_all.SEED)
+    return {**found, 'of': digest(flat)}
 
 
 REFERENCES = {  # environments and evaluation

@@ -28,6 +28,7 @@ from gait_bench import position
 from trl_suite import policies, suite
 from trl_suite.cli.arguments import positive
 from trl_suite.policies import Policy
+from trl_suite.util.digest import digest
 from trl_suite.util.options import checked
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
@@ -120,7 +121,8 @@ def main() -> None:
         copies.reset()
         enough = arguments.metres, int(arguments.budget)
         result: dict[str, Any] = {
-            'asked': arguments.metres, 'budget': int(arguments.budget), 'seed': arguments.seed,
+            'of': digest(policy), 'asked': arguments.metres, 'budget': int(arguments.budget),
+            'seed': arguments.seed,
         }  # fmt: skip
         for kind in ('base', 'noisy'):
             found = [

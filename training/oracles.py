@@ -38,6 +38,7 @@ from gait_bench import nudged, position
 
 from trl_suite import policies, suite
 from trl_suite.registry import catalogue
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -226,7 +227,7 @@ def main() -> None:
             parser.error(f'--condition is for footstep controllers, not for {id_}')
         found = of_gait(*options) if gait else of_tracking(*options, condition)
         found |= {'falls': arguments.falls, 'seed': arguments.seed, 'policy': policy.id}
-        found |= {'samples': policy.info.get('samples')}
+        found |= {'samples': policy.info.get('samples'), 'of': digest(policy)}
         found['cpu_seconds'] = round(time.process_time() - begin)
         print(id_, found, flush=True)
         key = f'{id_}: {condition}' if condition else id_

@@ -77,7 +77,7 @@ def main() -> None:
             id_, lambda environments: policy, arguments.episodes, 0, controller=controller
         )
         under = how + (controller if isinstance(controller, str) else ', '.join(controller))
-        print(under, {name: round(value, 3) for name, value in result.items()}, flush=True)
+        print(under, evaluate_plans.shown(result), flush=True)
         if arguments.enter:
             runs.add('plans.json', id_, under, {**result, 'training': training})
 

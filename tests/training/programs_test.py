@@ -983,6 +983,9 @@ class PlansTest(absltest.TestCase):
         self.assertLess(found['reward'], 0.05)
         self.assertGreater(found['falls_per_km'], 50)
         self.assertEqual(found['at_goal'], 0)
+        walker = policies.reference('PD_Biped3D_LLC_General_Step-v0')
+        self.assertEqual(found['controllers'], [digest(walker)])
+        self.assertEqual(found.keys() - evaluate_plans.shown(found), {'controllers'})
 
     def test_without_hierarchy(self):
         """A walker that always acts at its limits falls at once; a step lasts 1/30 s."""
@@ -996,6 +999,15 @@ class PlansTest(absltest.TestCase):
         self.assertBetween(found['seconds'], 0.1, 5)
         self.assertAlmostEqual(found['seconds'] * 60, round(found['seconds'] * 60), 6)
         self.assertLess(found['reward'], found['seconds'] / evaluate_plans.SECONDS)
+        self.assertNotIn('controllers', found)
+
+    def test_results_name_the_weights(self):
+        id_ = 'PD_Biped3D_HLC_Soccer-v0'
+        planner, walker = (policies.reference(each) for each in (id_, evaluate_footsteps.ID))
+        found = evaluate_plans.run(id_, lambda _: planner, episodes=1, seed=0, step_limit=2)
+        self.assertEqual((found['of'], found['controllers']), (digest(planner), [digest(walker)]))
+        found = evaluate_footsteps.run(suite.find(walker.id), walker, 1, 0, 3.0)
+        self.assertEqual(found['of'], digest(walker))
 
     def test_policies_of_tasks(self):
         planned, direct = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_Terrain_Forest_Hard-v0'
