@@ -59,7 +59,7 @@ def command_line(
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--threads', type=int, default=0, help='0: all cores')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
