@@ -78,7 +78,11 @@ def tables() -> dict[str, dict[str, str]]:
     return {
         'action_spaces.md': {'returns': action_spaces()},
         'plaid.md': {'final rewards': plaid(0), 'changes': plaid(1)},
-        'terrain_adaptive_gaits.md': {'distances': gaits(), 'foresight': foresight()},
+        'terrain_adaptive_gaits.md': {
+            'distances': gaits(),
+            'stairs': stairs(),
+            'foresight': foresight(),
+        },
         'deeploco.md': {
             'footsteps': footsteps(),
             'plans': plans(),
@@ -191,6 +195,23 @@ def in_episodes(found: Iterable[dict[str, Any]], head: Iterable[str], rows: Iter
     [(count, seconds)] = {(each['episodes'], each['seconds']) for each in found}
     text = f'{count} episodes of {seconds:g} s each; shares without a fall with 95 % intervals (Wilson):'
     return f'{text}\n\n{table(head, rows)}'
+
+
+def stairs() -> str:
+    vertical, ramps = gallery.record('stairs'), gallery.record('ramps')
+    shown = [
+        (f'`{id}`', *(
+            '{:.1f} ({:.1f} to {:.1f})'.format(each['distance'], *each['distance_interval'])
+            for each in (found, ramps[id])
+        ))
+        for id, found in vertical.items()
+    ]  # fmt: skip
+    [(count, seed)] = {
+        (each['episodes'], each['seed']) for of in (vertical, ramps) for each in of.values()
+    }
+    text = f'Mean distance to a fall in {count} episodes with seed {seed}, and its 95 % confidence interval:'
+    head = 'environment', 'vertical, m', 'ramps of 0.1 m, m'
+    return f'{text}\n\n{table(head, shown)}'
 
 
 def foresight() -> str:

@@ -4,13 +4,15 @@
     python training/evaluate_references.py transfer PD_Dog2D_Gaps_Terrain-v0
 
 `default_gaits`: the default gait, where gait policies are trained. `transfer`: the policy of flat ground
-with the same observation, on the other PLAiD terrains. Prints the mean distances, and writes
-`trained/default_gaits.json` or `trained/transfer.json`: ID -> evaluation.
+with the same observation, on the other PLAiD terrains. `stairs` and `ramps`: the shipped policies on stairs
+with vertical faces, and with those of the 2016 program, in episodes that chose none of them. Prints the mean
+distances, and writes `trained/default_gaits.json` and so on: ID -> evaluation.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 from typing import Any
 
 import runs
@@ -22,6 +24,15 @@ from trl_suite.registry import catalogue
 from trl_suite.util import errors
 from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
+
+STAIRS_SEED = 20161128
+STAIRS = (
+    'FSM_Goat2D_Terrain_Variable_Steps-v0',
+    *(
+        f'FSM_{character}2D_Terrain_Stairs_Rugged-v0'
+        for character in ('Dog', 'Raptor', 'Hopper', 'Biped')
+    ),
+)
 
 
 def flat_ground(spec: catalogue.EnvSpec) -> str:
@@ -41,12 +52,22 @@ def of_flat_ground(id_: str) -> dict[str, Any]:
     return {**found, 'of': digest(flat)}
 
 
+def of_stairs(id_: str, **options: Any) -> dict[str, Any]:
+    policy = policies.reference(id_)
+    episodes = train_all.GAIT_EPISODES
+    found = evaluation.evaluate(id_, policy, episodes, STAIRS_SEED, task_kwargs=options)
+    kept = ('distance', 'distance_interval', 'episodes', 'seed', 'step_limit')
+    return {**{name: found[name] for name in kept}, **options, 'of': digest(policy)}
+
+
 REFERENCES = {  # environments and evaluation
     'default_gaits': (train_all.GAITS, of_default_gait),
     'transfer': (
         tuple(s.id for s in catalogue.SPECS if s.domain == 'plaid' and s.terrain != 'flat'),
         of_flat_ground,
     ),
+    'stairs': (STAIRS, of_stairs),
+    'ramps': (STAIRS, functools.partial(of_stairs, face_length=0.1)),
 }
 
 
