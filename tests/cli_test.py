@@ -408,7 +408,8 @@ class TrainedTest(CommandTest):
         self.assert_only('mine.npz', 'a.json')
         expected = evaluation.evaluate(GAPS, self.policy, 5, 3)
         found = json.loads(pathlib.Path('a.json').read_text())
-        self.assertEqual(found, {**expected, 'policy': 'mine.npz'})
+        more = {'policy': 'mine.npz', 'trl_suite': trl_suite.__version__}
+        self.assertEqual(found, {**expected, **more})
         self.assertStartsWith(out, f'{GAPS}\n')
         for fact in (
             f'return {expected["return"]:.2f} +- {expected["return_interval"]:.2f} (95 % confidence)',
@@ -459,6 +460,9 @@ class EvaluateTest(CommandTest):
         self.assertRegex(out, r'\n  length +3.0 of 3 steps\n')
         self.assertRegex(out, r'\n  return +[\d.]+, [\d.]+% of the maximum 3\n')  # no interval
         self.assertRegex(out, r'\n  distance +-?[\d.]+ m, median')
+        self.output(*words[:-4], '--option', 'step_limit=2', '--episodes', '1', '--json', 'a.json')
+        found = json.loads(pathlib.Path('a.json').read_text())
+        self.assertEqual((found['options'], found['step_limit']), ({'step_limit': 2}, 2))
 
     @parameterized.parameters(
         ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
