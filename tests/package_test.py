@@ -3,6 +3,7 @@
 import ast
 import os
 import pathlib
+import platform
 import re
 import shutil
 import site
@@ -22,7 +23,7 @@ from packaging.requirements import Requirement
 
 import tests
 import trl_suite
-from trl_suite.util import libraries
+from trl_suite.util import libraries, machine
 
 CHECKOUT = pathlib.Path(__file__).resolve().parents[1]
 TRAINED = 'PD_Dog2D_Gaps_Terrain-v0'
@@ -174,6 +175,29 @@ class ImportTest(parameterized.TestCase):
         """
         out, _ = python(code, PYTHONOPTIMIZE='2', NUMBA_DISABLE_JIT='1')
         self.assertEqual(out, 'True\n')
+
+
+class MachineTest(parameterized.TestCase):
+    """The class of CPU, on which results are equal bit for bit."""
+
+    @parameterized.parameters(
+        ('Haswell', 'Haswell'), ('Zen', 'Haswell'), ('Sandybridge', 'Sandybridge'),
+    )  # fmt: skip
+    def test_names_the_functions_that_multiply_matrices(self, core, expected):
+        """What OpenBLAS computes with, which need not be the newest that the processor has."""
+        if not machine.cpu_class().startswith('x86_64 ') or 'AVX' in machine.cpu_class():
+            self.skipTest('not OpenBLAS on x86_64')
+        code = 'from trl_suite.util import machine; print(machine.cpu_class())'
+        self.assertEqual(python(code, OPENBLAS_CORETYPE=core), (f'x86_64 {expected}\n', ''))
+
+    def test_with_another_library_names_vector_instructions(self):
+        has = {'avx512f': False, 'avx2': True, 'sse2': True}
+        with (
+            mock.patch('llvmlite.binding.get_host_cpu_features', return_value=has),
+            mock.patch.object(machine.ctypes, 'CDLL', return_value=None),
+        ):
+            found = machine.cpu_class.__wrapped__()
+        self.assertEqual(found, f'{platform.machine()} AVX2')
 
 
 class WheelTest(FolderTest):

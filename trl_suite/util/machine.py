@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import importlib.metadata
 import math
@@ -10,6 +11,8 @@ import pathlib
 import platform
 
 PACKAGES = ('mujoco', 'dm-control', 'numpy')
+_CORE_NAME = 'openblas_get_corename'  # function of OpenBLAS; NumPy's wheels rename it
+_SAME_KERNELS = {'Zen': 'Haswell', 'Cooperlake': 'SkylakeX'}  # results are equal, bit for bit
 _VECTORS = {'avx512f': 'AVX-512', 'avx2': 'AVX2'}  # the widest first, by LLVM's names
 _QUOTA = pathlib.Path('/sys/fs/cgroup/cpu.max')  # microseconds, or max; period
 
@@ -39,10 +42,20 @@ def processor() -> str:
 
 @functools.cache
 def cpu_class() -> str:
-    """Returns architecture and widest vector instructions of the processor, e.g. 'x86_64 AVX-512'.
+    """Returns the architecture, and which functions multiply matrices, e.g. 'x86_64 Haswell'.
 
-    NumPy and its BLAS choose functions by these, which may differ in the last bits of their results.
+    OpenBLAS has them for several processors, and chooses by more than vector instructions; they differ
+    in the last bits of policies' actions. With another BLAS, which does not tell, it is the widest
+    vector instructions.
     """
+    from numpy.linalg import _umath_linalg
+
+    blas = ctypes.CDLL(_umath_linalg.__file__)  # and the libraries that it needs
+    for name in (f'scipy_{_CORE_NAME}64_', f'{_CORE_NAME}64_', _CORE_NAME):
+        if function := getattr(blas, name, None):
+            function.restype = ctypes.c_char_p
+            core = function().decode()
+            return f'{platform.machine()} {_SAME_KERNELS.get(core, core)}'
     from llvmlite import binding
 
     has = binding.get_host_cpu_features()
