@@ -30,6 +30,7 @@ PAGE, FOLDER = DOCS / 'benchmark.md', DOCS / 'benchmark'
 ENTRIES = DOCS.parent / 'benchmarks' / 'entries'
 BUDGET = benchmark.BUDGETS['1M']
 BASELINES = ('PPO', 'SAC', 'SuitePPO', 'TD3', 'TQC')  # the entries that are made here
+COMPARED = ('PPO', 'SuitePPO')  # learners are ranked in the environments that these have
 FIGURES = {'curves': 'report', 'environments': 'report', 'levels': 'levels'}  # and their data
 
 
@@ -76,11 +77,10 @@ def levels() -> str:
 
 
 def entries() -> dict[str, Any]:
-    """Returns the report of the learners with the most environments.
+    """Returns the report of the learners that have all environments of those in `COMPARED`.
 
-    A report counts only environments that are common to its learners, so that learners with fewer, or
-    others, are only in 'further': the scores of their runs after each part, (runs, 20), by learner and
-    environment.
+    Learners that lack some, and other environments, are in 'further': the scores of their runs after
+    each part, (runs, 20), by learner and environment.
 
     Raises:
       ValueError: an invalid result, or one with other settings than those of the benchmark.
@@ -97,20 +97,27 @@ def entries() -> dict[str, Any]:
                 raise ValueError(f'{path}: {"; ".join(notes)}')
             results.setdefault(name, []).append({**result, 'learner': name})
     ids = {name: {each['environment'] for each in of} for name, of in results.items()}
-    most = max(ids.values(), key=len)
-    found = report(each for name, of in results.items() if ids[name] == most for each in of)
+    asked = set.intersection(*(ids[f'{name} (baseline)'] for name in COMPARED))
+    ranked: list[dict[str, Any]] = []
     further: dict[str, dict[str, list[list[float]]]] = {}
     for name, of in results.items():
-        for each in of if ids[name] != most else ():
+        for each in of:
             id = each['environment']
-            curve = [benchmark.normalised(id, score) for (score,) in each['scores']]
-            further.setdefault(name, {}).setdefault(id, []).append(curve)
-    return {**found, 'further': further}
+            if id in asked and asked <= ids[name]:
+                ranked.append(each)
+            else:
+                curve = [benchmark.normalised(id, score) for (score,) in each['scores']]
+                further.setdefault(name, {}).setdefault(id, []).append(curve)
+    return {**report(ranked), 'further': further}
 
 
 def every(found: dict[str, Any]) -> dict[str, dict[str, list[list[float]]]]:
     """Returns the curves of all learners by environment."""
-    return {name: of['scores'] for name, of in found['learners'].items()} | found['further']
+    ranked, further = found['learners'], found['further']
+    return {
+        name: {**ranked.get(name, {'scores': {}})['scores'], **further.get(name, {})}
+        for name in (*ranked, *(name for name in further if name not in ranked))
+    }
 
 
 def leaderboard(found: dict[str, Any]) -> str:
@@ -147,15 +154,17 @@ def pictures(found: dict[str, Any]) -> None:
         right.set(xlabel='score', ylabel='share of runs above')
         left.legend()
         _save(figure, 'curves')
-        rows = -(-len(found['environments']) // 4)
+        curves = every(found)
+        ids = [id for id in benchmark.CORE if any(id in of for of in curves.values())]
+        rows = -(-len(ids) // 4)
         figure, grid = pyplot.subplots(
             rows, 4, figsize=(8, 2 * rows), sharex=True, sharey=True, layout='constrained'
         )
-        for axes in grid.flat[len(found['environments']) :]:
+        for axes in grid.flat[len(ids) :]:
             axes.remove()
         lines: dict[str, Any] = {}
-        for axes, id in zip(grid.flat, found['environments'], strict=False):
-            for i, (learner, of) in enumerate(every(found).items()):
+        for axes, id in zip(grid.flat, ids, strict=False):
+            for i, (learner, of) in enumerate(curves.items()):
                 for run in of.get(id, ()):
                     axes.plot(samples, run, color=f'C{i}', alpha=0.3, linewidth=0.7)
                 if id in of:

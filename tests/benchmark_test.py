@@ -197,7 +197,7 @@ class ReportTest(parameterized.TestCase):
         shares = dict(zip(report.THRESHOLDS.round(2), np.array(a['profile'])[:, 0], strict=True))
         self.assertEqual((shares[0.0], shares[0.45], shares[1.2]), (1, 0.5, 0.125))
         self.assertAlmostEqual(found['improvement']['m:A, m:B'][0], (0.25 + 1) / 2)
-        self.assertAlmostEqual(found['improvement']['m:B, m:A'][0], (0.75 + 0) / 2)
+        self.assertEqual([*found['improvement']], ['m:A, m:B'])
         self.assertEqual(found, json.loads(json.dumps(found)))
         text = report.table(found)
         self.assertIn('| m:A | 4 | 0.450 (', text)
@@ -257,19 +257,24 @@ class PageTest(FolderTest):
         id_ = [*benchmark.CORE][i]
         return {**result_of('mine:Search', id_, 0, score), 'budget': 1_000_000, **changes}
 
-    def test_two_learners_of_one_name(self):
+    def test_who_is_ranked(self):
+        """Learners with the environments of both baselines, in these, also if their class has one name."""
         program, found = self.entries(
-            one=[self.result(0, 0.2), self.result(1, 0.3)], SAC=[self.result(0, 0.6)],
-            two=[self.result(0, 0.4), self.result(1, 0.5)], three=[self.result(2, 0.9)],
+            PPO=[self.result(0, 0.2), self.result(1, 0.3), self.result(3, 0.1)],
+            SuitePPO=[self.result(0, 0.4), self.result(1, 0.5)], SAC=[self.result(0, 0.6)],
+            two=[self.result(i, 0.7) for i in range(3)], three=[self.result(2, 0.9)],
         )  # fmt: skip
-        self.assertEqual([*found['learners']], ['one', 'two'])
-        self.assertEqual([*found['further']], ['SAC (baseline)', 'three'])
-        self.assertAlmostEqual(found['further']['three'][[*benchmark.CORE][2]][0][-1], 0.9)
+        ids, ranked = [*benchmark.CORE], ['PPO (baseline)', 'SuitePPO (baseline)', 'two']
+        self.assertEqual(([*found['learners']], found['environments']), (ranked, ids[:2]))
+        further = {name: [*of] for name, of in found['further'].items()}
+        expected = {'PPO (baseline)': ids[3:4], 'SAC (baseline)': ids[:1], 'three': ids[2:3]}
+        self.assertEqual(further, {**expected, 'two': ids[2:3]})
+        self.assertAlmostEqual(found['further']['three'][ids[2]][0][-1], 0.9)
         text = program.leaderboard(found)
         self.assertIn('| SAC (baseline) | 1 | 0.600 |', text)
-        self.assertLess(text.index('| two | 1 |'), text.index('| one | 1 |'))
-        best = [line.split(' | ')[-1] for line in program.core(found).splitlines()[2:6]]
-        self.assertEqual(best, ['0.60 |', '0.50 |', '0.90 |', '– |'])
+        self.assertLess(text.index('| two | 1 |'), text.index('| SuitePPO (baseline) | 1 |'))
+        best = [line.split(' | ')[-1] for line in program.core(found).splitlines()[2:7]]
+        self.assertEqual(best, ['0.70 |', '0.70 |', '0.90 |', '0.10 |', '– |'])
 
     @parameterized.parameters(
         ({'budget': 10_000_000}, '0.json: budget is 10000000, not 1000000'),
@@ -278,7 +283,7 @@ class PageTest(FolderTest):
     )
     def test_other_settings_are_refused(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):
-            self.entries(one=[self.result(0, 0.2, **changes)])
+            self.entries(PPO=[self.result(0, 0.2, **changes)])
 
 
 class ReportCommandTest(CommandTest):

@@ -108,7 +108,7 @@ def report(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
         'learners': learners,
         'improvement': {
             f'{a}, {b}': _improvement(curves[a][..., -1], curves[b][..., -1])
-            for a, b in itertools.permutations(curves, 2)
+            for a, b in itertools.combinations(curves, 2)
         },
     }
 
