@@ -672,8 +672,8 @@ class ShippedTest(parameterized.TestCase):
         folder = resources.directory('trained')
         names = {path.stem for path in folder.iterdir() if path.suffix in ('.npz', '.json')}
         studies = {
-            'footsteps', 'default_gaits', 'foresight', 'oracles', 'oracle_falls', 'plans', 'shared',
-            'transfer',
+            'footsteps', 'default_gaits', 'foresight', 'oracles', 'oracle_falls', 'plans', 'ramps', 'shared',
+            'stairs', 'transfer',
         }  # fmt: skip
         self.assertEqual(names - set(catalogue.BY_ID) - studies, set())
         self.assertTrue((folder / 'README.md').exists())
