@@ -16,7 +16,6 @@ import io
 import pathlib
 import platform
 import re
-import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -196,10 +195,8 @@ def remove(folder: pathlib.Path) -> None:
         return
     if any(folder.iterdir()) and not any((folder / name).exists() for name in WRITTEN):
         raise FileExistsError(f'{folder}: is not the folder of a run; remove it, or choose another')
-    outer = tempfile.TemporaryDirectory(
-        prefix=f'.{folder.name}.', suffix='.part', dir=folder.parent, ignore_cleanup_errors=True
-    )
-    with only_run(folder), outer as aside:  # a killed process leaves a whole run, or none
+    # A killed process leaves a whole run, or none.
+    with only_run(folder), files.folder_beside(folder) as aside:
         folder.rename(pathlib.Path(aside, folder.name))
 
 

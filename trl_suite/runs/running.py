@@ -8,7 +8,6 @@ import hashlib
 import os
 import pathlib
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
@@ -315,20 +314,14 @@ def _forget(path: pathlib.Path, done: int) -> None:
 def _remove(folder: pathlib.Path) -> None:
     """Removes a learner's state, and no other folder."""
     if (folder / MARK).is_file():
-        with _beside(folder) as outer:  # a killed process leaves a whole state, or none
+        with files.folder_beside(folder) as outer:  # a killed process leaves a whole state, or none
             os.replace(folder, pathlib.Path(outer, folder.name))
-
-
-def _beside(path: pathlib.Path) -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(
-        prefix=f'.{path.name}.', suffix='.part', dir=path.parent, ignore_cleanup_errors=True
-    )
 
 
 @contextlib.contextmanager
 def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary folder that replaces `path` if no exception is raised."""
-    with _beside(path) as outer:
+    with files.folder_beside(path) as outer:
         part = pathlib.Path(outer, path.name)
         part.mkdir()
         yield part

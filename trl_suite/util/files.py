@@ -11,6 +11,7 @@ import pathlib
 import re
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from typing import Any, TextIO
 
@@ -184,6 +185,13 @@ def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
     # Processes on other machines or in other containers may have the same number.
     number = f'{os.getpid()}-{secrets.token_hex(4)}'
     return path.with_name(f'.{path.stem}.{number}.{kind}{path.suffix.lower()}')
+
+
+def folder_beside(path: pathlib.Path) -> tempfile.TemporaryDirectory[str]:
+    """Returns a temporary folder from or to which `path` can be renamed; a context, as `replacing`."""
+    return tempfile.TemporaryDirectory(
+        prefix=f'.{path.name}.', suffix='.part', dir=path.parent, ignore_cleanup_errors=True
+    )
 
 
 def between(page: str, name: str, program: str, text: str) -> str:
