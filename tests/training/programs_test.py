@@ -10,6 +10,7 @@ import pathlib
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from types import SimpleNamespace
 from unittest import mock
@@ -897,7 +898,7 @@ class ProgramsTest(FolderTest):
             raise KeyboardInterrupt
 
         with (
-            mock.patch.object(runs.tempfile.TemporaryDirectory, 'cleanup', stop),
+            mock.patch.object(tempfile.TemporaryDirectory, 'cleanup', stop),
             self.assertRaises(KeyboardInterrupt),
         ):
             runs.remove(self.folder / 'run')
