@@ -81,6 +81,16 @@ class InBackground(threading.Thread):
         return self.value
 
 
+class OneProcess(concurrent.futures.ProcessPoolExecutor):
+    """Runs each task in a new process of this machine, one at a time."""
+
+    def __init__(self, *_, **__):
+        super().__init__(1, multiprocessing.get_context('spawn'), max_tasks_per_child=1)
+
+    def cancel(self):
+        self.shutdown(cancel_futures=True)
+
+
 class TwoNodes(absltest.TestCase):
     def setUp(self):
         super().setUp()
@@ -200,6 +210,15 @@ class ExecutorTest(TwoNodes):
         ):
             list(executor.map(len, ['text']))
 
+    def test_who_waits_for_cancelled_tasks_is_told(self):
+        executor = self.connect()
+        waiting = InBackground(lambda: list(executor.map(time.sleep, [2 * PATIENCE] * 3)))
+        wait_until(lambda: ray.available_resources().get('CPU', 0) == 0, 'no tasks run')
+        executor.cancel()
+        with self.assertRaises(ray.exceptions.RayError):
+            waiting.result()
+        wait_until(lambda: ray.available_resources().get('CPU', 0) == 2, 'tasks go on')
+
     def test_a_task_that_no_node_can_run(self):
         with self.assertWarnsRegex(UserWarning, 'no node has the 64 cores and 0.0 GB'):
             self.connect(num_cpus=64)
@@ -229,10 +248,7 @@ class TrainingTest(TwoNodes):
         short = lambda id_, **_: settings_for(id_, **self.SETTINGS)  # noqa: E731
         self.enterContext(mock.patch.object(ppo, 'settings_for', short))
         local, remote = self.folder(), self.folder()
-        one = lambda *_, **__: concurrent.futures.ProcessPoolExecutor(  # noqa: E731
-            1, multiprocessing.get_context('spawn'), max_tasks_per_child=1
-        )
-        with mock.patch('trl_suite.adapters.ray.RayExecutor', one):
+        with mock.patch('trl_suite.adapters.ray.RayExecutor', OneProcess):
             expected = self.train(local)
         self.assertLen(expected, 2 * 4)
         again = InBackground(lambda: self.train(remote, '--address', self.cluster.address))
@@ -245,6 +261,23 @@ class TrainingTest(TwoNodes):
         logs = [path.read_text() for path in (remote / 'runs').glob('*/*/log.txt')]
         self.assertLen(logs, 4)
         self.assertEqual(sum('continues on' in log for log in logs), 1)
+
+    def test_a_stop_ends_the_runs_and_enters_nothing(self):
+        folder = self.folder()
+        running = subprocess.Popen(
+            [
+                sys.executable, ROOT / 'training' / 'train_all.py', '--filter', 'PD_Biped2D_Flat-v0',
+                '--samples', '1e9', '--runs', folder / 'runs', '--ray', '--address', self.cluster.address,
+            ],
+            env={**os.environ, 'TRL_SUITE_TRAINED': str(folder / 'trained')}, cwd=folder,
+        )  # fmt: skip
+        self.addCleanup(running.kill)
+        self.connect()
+        wait_until(lambda: ray.available_resources().get('CPU', 0) == 1, 'no run has begun')
+        running.terminate()
+        self.assertEqual(running.wait(PATIENCE), 1)
+        wait_until(lambda: ray.available_resources().get('CPU', 0) == 2, 'the run goes on')
+        self.assertFalse((folder / 'trained').exists())
 
     def test_programs_give_the_same_results_with_and_without_ray(self):
         found = []

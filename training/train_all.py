@@ -320,16 +320,13 @@ def enter(id_: str, seed: int, run: Run, overwrite: bool = False) -> None:
             del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
 
 
-def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callable[[str, int], Run]:
+def on_ray(
+    arguments: argparse.Namespace, executor: evaluation.Executor
+) -> Callable[[str, int], Run]:
     """Returns a function that trains by a task of Ray."""
     import storage
 
-    from trl_suite.adapters.ray import RayExecutor
-
     url = storage.absolute(arguments.runs)
-    executor = stack.enter_context(
-        RayExecutor(arguments.address, num_cpus=1, memory=int(MEMORY), fresh=True)
-    )
 
     def work(id_: str, seed: int) -> Run:
         place = f'{url}/{id_}/seed_{seed}'
@@ -390,15 +387,25 @@ def main(words: Sequence[str] | None = None) -> None:
         entered = any(r['seed'] == seed and r['settings'] == own for r in entries(id_))
         if arguments.overwrite or not entered:
             todo.append((id_, seed))
-    entering = threading.Lock()  # two seeds of one environment write the same file
-    failed, children = 0, Children()
+    # Two seeds of one environment write the same file, which is not locked on all systems.
+    entering = {id_: threading.Lock() for id_, _ in todo}
+    failed = 0
     with contextlib.ExitStack() as stack:
-        done_by = on_ray(arguments, stack) if arguments.ray else in_processes(arguments, children)
+        if arguments.ray:
+            from trl_suite.adapters.ray import RayExecutor
+
+            executor = stack.enter_context(
+                RayExecutor(arguments.address, num_cpus=1, memory=int(MEMORY), fresh=True)
+            )
+            done_by, stop = on_ray(arguments, executor), executor.cancel
+        else:
+            children = Children()
+            done_by, stop = in_processes(arguments, children), children.stop
         # Ray decides how many runs there are at a time.
         number = max(len(todo), 1) if arguments.ray else arguments.jobs
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(number))
         # After an interrupt, before the pool waits for its threads.
-        stack.callback(children.stop)
+        stack.callback(stop)
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         bar = stack.enter_context(tqdm.tqdm(total=len(todo), unit='run'))
 
@@ -407,7 +414,7 @@ def main(words: Sequence[str] | None = None) -> None:
             if any(future.exception() for future in before):
                 raise RuntimeError('not trained, since a run failed whose policy it uses')
             run = done_by(id_, seed)
-            with entering:
+            with entering[id_]:
                 enter(id_, seed, run, arguments.overwrite)
             return run
 

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 import socket
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -57,7 +59,10 @@ def connect(address: str | None = None) -> None:
                     'machine starts one'
                 ) from error
             address = 'local'  # that cluster has ended without `ray stop`
+    before = signal.getsignal(signal.SIGTERM)
     ray.init(address, log_to_driver=False, logging_level='ERROR')
+    if callable(before) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)  # instead of Ray's handler
 
 
 class RayExecutor:
@@ -88,6 +93,7 @@ class RayExecutor:
         self._begun = not ray.is_initialized()
         if self._begun:
             connect(address)
+        self._tasks: set[Any] = set()  # that are not done
         needed = {'CPU': num_cpus, 'memory': memory}
         if not any(
             all(node['Resources'].get(name, 0) >= number for name, number in needed.items())
@@ -118,9 +124,29 @@ class RayExecutor:
             self._call.remote(expected, function, *arguments)
             for arguments in zip(*iterables, strict=False)
         ]
-        results = _results(tasks)
+        self._tasks.update(tasks)
+        results = self._results(tasks)
         next(results)  # only a generator that has begun cancels what is left at its end
         return results
+
+    def _results(self, tasks: list[Any]) -> Iterator[Any]:
+        """Yields None, then results; cancels the tasks that are left if the caller stops or a task fails."""
+        try:
+            yield None
+            while tasks:
+                yield ray.get(tasks[0])
+                self._tasks.discard(tasks.pop(0))
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        finally:
+            for task in tasks:
+                ray.cancel(task)
+            self._tasks.difference_update(tasks)
+
+    def cancel(self) -> None:
+        """Kills the tasks that are not done; who waits for their results gets a RayError."""
+        for task in list(self._tasks):
+            ray.cancel(task, force=True)  # libraries may catch the exception that is raised otherwise
 
     def close(self) -> None:
         """Disconnects; ends a Ray that this object has started."""
@@ -132,20 +158,6 @@ class RayExecutor:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _results(tasks: list[Any]) -> Iterator[Any]:
-    """Yields None, then results; cancels the tasks that are left if the caller stops or a task fails."""
-    try:
-        yield None
-        while tasks:
-            yield ray.get(tasks[0])
-            del tasks[0]
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from error
-    finally:
-        for task in tasks:
-            ray.cancel(task)
 
 
 def _call(expected: str, function: Callable[..., Any], *arguments: Any) -> Any:
