@@ -8,6 +8,7 @@ import math
 import os
 import resource
 import shutil
+import signal
 import struct
 import sys
 import time
@@ -50,6 +51,7 @@ READERS = (
     *((f'a{suffix}', terrain.from_mesh) for suffix in terrain.mesh.READ),
     *((f'a{suffix}', lambda path: terrain.from_image(path, 1)) for suffix in terrain.custom.IMAGES),
 )  # fmt: skip
+ABORTED = signal.strsignal(signal.SIGABRT)
 ACCESSOR = {'bufferView': 0, 'componentType': 5126, 'count': 3, 'type': 'VEC3'}
 PRIMITIVE = {'attributes': {'POSITION': 0}}
 
@@ -324,13 +326,13 @@ class LimitsTest(FolderTest):
         self.check_character_file(name)
 
     @parameterized.parameters(
-        (os.abort, (), ValueError, 'reading it failed: Aborted; expected what can be read in'),
-        (os._exit, (3,), ValueError, 'reading it failed: status 3; expected'),
-        (math.sqrt, (-1,), ValueError, 'math domain error|expected a nonnegative'),
-        (math.factorial, ('1',), ValueError, 'TypeError: .*; expected what can be read'),
+        (os.abort, (), f'reading it failed: {ABORTED}; expected what can be read in'),
+        (os._exit, (3,), 'reading it failed: status 3; expected'),
+        (math.sqrt, (-1,), 'math domain error|expected a nonnegative'),
+        (math.factorial, ('1',), 'TypeError: .*; expected what can be read'),
     )  # fmt: skip
-    def test_functions_that_fail(self, function, arguments, kind, message):
-        with self.assertRaisesRegex(kind, message):
+    def test_functions_that_fail(self, function, arguments, message):
+        with self.assertRaisesRegex(ValueError, message):
             limited.call(function, *arguments)
 
     def test_a_process_that_does_not_start(self):

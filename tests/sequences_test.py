@@ -754,7 +754,7 @@ class BaselinesTest(CommandTest):
         result = self.run_short(kind, 'result')
         found = np.array(result['samples'])
         np.testing.assert_array_equal(found > 0, expected.astype(bool))
-        # PPO takes whole batches of 256 samples.
+        # PPO takes whole batches of at most 256 samples.
         np.testing.assert_array_equal(found.sum(1), found.sum(1).clip(600 - 256, 600))
         self.assertEqual(sequences.read('result.json'), result)
         self.assertNotEqual(result['scores'][0], result['initial'])

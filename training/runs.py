@@ -75,6 +75,7 @@ def command_line(
 
 def check_seeds(option: str, *seeds: int) -> None:
     """Refuses to train with the seed of published results, which draws the same starts and terrains."""
+    checked(option, list(seeds), list[int], at_least=0)
     if TEST_SEED in seeds:
         raise ValueError(f'{option}: {TEST_SEED} is the seed of the tests; choose another')
 
@@ -195,9 +196,8 @@ def remove(folder: pathlib.Path) -> None:
         return
     if any(folder.iterdir()) and not any((folder / name).exists() for name in WRITTEN):
         raise FileExistsError(f'{folder}: is not the folder of a run; remove it, or choose another')
-    # A killed process leaves a whole run, or none.
-    with only_run(folder), files.folder_beside(folder) as aside:
-        folder.rename(pathlib.Path(aside, folder.name))
+    with only_run(folder):
+        files.remove_folder(folder)
 
 
 # Results in `trained/`, or in the folder TRL_SUITE_TRAINED.

@@ -10,7 +10,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from types import SimpleNamespace
 from unittest import mock
@@ -46,7 +45,7 @@ from trl_suite.util import files
 from trl_suite.util.digest import digest
 from trl_suite.vector import VectorEnvironment
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / 'benchmarks'))
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[2] / 'benchmarks'))
 import actuators
 import contacts
 import physics_rate
@@ -104,7 +103,7 @@ class CompareTest(FolderTest):
         self.assertEqual(second, [(action, 2) for action, _ in first])
         self.assertIn('| one of the base actions | 108 | 208 | 158 ± 635 | 3.0 |', out)
         self.assertIn('in `FSM_Dog2D_Terrain_Mixed-v0`', out)
-        message = 'samples is 32768.*, not 100.*; give another file'
+        message = 'samples is 32768.*, not 100.*; give these, or another file'
         with self.assertRaisesRegex(ValueError, message):
             self.run_program('actions', self.action, '--samples', '100')
 
@@ -272,7 +271,9 @@ class JobsTest(FolderTest):
             return children[-1]
 
         def stopped(running):
+            latest = time.monotonic() + 60
             while not begun.exists():
+                self.assertLess(time.monotonic(), latest, 'no run has begun')
                 time.sleep(0.01)
             raise KeyboardInterrupt
 
@@ -281,8 +282,8 @@ class JobsTest(FolderTest):
         with (
             mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(trained)),
             mock.patch.object(ppo, '__file__', str(script)),
-            mock.patch.object(train_all.subprocess, 'Popen', started),
-            mock.patch.object(train_all.concurrent.futures, 'as_completed', stopped),
+            mock.patch.object(subprocess, 'Popen', started),
+            mock.patch('concurrent.futures.as_completed', stopped),
             self.assertRaises(KeyboardInterrupt),
         ):
             output(lambda: train_all.main(words))
@@ -691,13 +692,23 @@ class PlannerTransferTest(absltest.TestCase):
 
 
 class RecordsTest(absltest.TestCase):
-    def test_records_are_of_the_policies_beside_them(self):
+    def test_records_name_the_policies_that_they_are_of(self):
         """Records from before digests were stored have none."""
-        for variant in ('', 'generalist'):
+        named = {}
+        for variant in ('', 'generalist', 'randomized'):
             for path in runs.place(variant).glob('*_*.json'):
-                found, own = runs.read(f'{variant}/{path.name}'), path.with_suffix('.npz')
-                if 'of' in found:
-                    self.assertEqual(found['of'], digest(policies.load(own)), path)
+                of = runs.read(f'{variant}/{path.name}').get('of')
+                named[path.with_suffix('.npz')] = (
+                    of['evaluations'] if variant == 'randomized' else of
+                )
+        for table in ('stairs.json', 'ramps.json'):
+            for id_, found in runs.read(table).items():
+                named[table, id_] = found['of']
+        named = {key: of for key, of in named.items() if of}
+        self.assertGreater(len(named), 15)
+        for key, of in named.items():
+            policy = policies.reference(key[1]) if isinstance(key, tuple) else policies.load(key)
+            self.assertEqual(of, digest(policy), key)
 
 
 class StoredPagesTest(parameterized.TestCase):
@@ -823,16 +834,17 @@ class ProgramsTest(FolderTest):
         levels = {'FILE': path, 'IDS': (id_,), 'COUNTS': (10,)}
         self.enterContext(mock.patch.object(runs, 'place', lambda _: path))
         self.enterContext(mock.patch.object(policies, 'reference', lambda id_, *_: id_))
-        for program, found, (table, row) in (
-            (lambda: output(compare.main, 'actions', '--json', path), own, ('results', 'both/1')),
-            (lambda: output(generalisation.main, '--output', self.folder), [0.5, 0.4], (id_, '10')),
-            (lambda: train_randomized.measure(id_), result, ('before', 'harsh')),
-        ):
+        given = {'samples': compared.samples, 'results': {}}
+        for program, found, (table, row), start in (
+            (lambda: output(compare.main, 'actions', '--json', path), own, ('results', 'both/1'), given),
+            (lambda: output(generalisation.main, '--output', self.folder), [0.5, 0.4], (id_, '10'), {}),
+            (lambda: train_randomized.measure(id_), result, ('before', 'harsh'), {}),
+        ):  # fmt: skip
             asked = []
 
-            def measure(*arguments, found=found, asked=asked):
+            def measure(*arguments, found=found, asked=asked, start=start):
                 asked.append(arguments)
-                with files.changing(path) as content:
+                with files.changing(path, start) as content:
                     content.setdefault('another', []).append(len(asked))
                 return found
 
@@ -867,7 +879,9 @@ class ProgramsTest(FolderTest):
             ({'limit': 3}, 'limit is None, not 3'),
         ):
             with (
-                self.assertRaisesRegex(ValueError, f'other settings: {error}; give another file'),
+                self.assertRaisesRegex(
+                    ValueError, f'other settings: {error}; give these, or another'
+                ),
                 files.changing(path, start),
             ):
                 pass
@@ -898,7 +912,7 @@ class ProgramsTest(FolderTest):
             raise KeyboardInterrupt
 
         with (
-            mock.patch.object(tempfile.TemporaryDirectory, 'cleanup', stop),
+            mock.patch.object(os, 'unlink', stop),
             self.assertRaises(KeyboardInterrupt),
         ):
             runs.remove(self.folder / 'run')

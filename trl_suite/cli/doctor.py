@@ -9,6 +9,7 @@ nor OpenGL.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -185,7 +186,11 @@ def compiled_code() -> Finding:
             'no folder for compiled code can be used: every process compiles again',
             'set NUMBA_CACHE_DIR to a folder of your own',
         )
-    sizes = [path.stat().st_size for path in folder.rglob('*') if path.is_file()]
+    sizes = []
+    for path in folder.rglob('*'):
+        with contextlib.suppress(FileNotFoundError):  # other processes rename temporary files
+            if path.is_file():
+                sizes.append(path.stat().st_size)
     text = f'compiled code in {folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB'
     return Finding(OK, text)
 

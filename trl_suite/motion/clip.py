@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike
 from trl_suite.motion import quaternion
 from trl_suite.motion.layout import LARGEST, SHORTEST, Layout, Mirror
 from trl_suite.util import archive, errors, resources
-from trl_suite.util.files import check_path
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
 STEPS_SUFFIX = '_steps'  # suffix of files that contain a step library instead of a clip
@@ -220,7 +219,6 @@ class Clip:
           ValueError: another suffix.
           OSError: the file cannot be written.
         """
-        path = check_path(path, ('.npz',))
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 

@@ -27,7 +27,6 @@ from trl_suite.motion import quaternion
 from trl_suite.motion.clip import STEPS_SUFFIX, VELOCITY_STEP, Clip, shipped
 from trl_suite.motion.layout import LARGEST, Layout
 from trl_suite.util import archive, errors, resources
-from trl_suite.util.files import check_path
 
 FEATURES = (
     *('right foot ahead of the root', 'right foot left of the root'),
@@ -185,7 +184,6 @@ class FootstepLibrary:
           ValueError: another suffix.
           OSError: the file cannot be written.
         """
-        path = check_path(path, ('.npz',))
         found = {field: getattr(self, field) for field in (*_FIELDS, *_LEFT)}
         archive.write(path, {field: value for field, value in found.items() if value is not None})
 

@@ -29,7 +29,7 @@ from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Policy
 from trl_suite.util import archive, errors, resources
 from trl_suite.util.archive import take
-from trl_suite.util.files import check_path, existing
+from trl_suite.util.files import existing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
@@ -80,7 +80,7 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
     fields |= {name: value for name, value in optional.items() if value is not None}
     small = {name: _small(value) for name, value in fields.items()}
-    archive.write(check_path(path, ('.npz',)), small)
+    archive.write(path, small)
 
 
 def load(path: str | os.PathLike[str]) -> Policy:

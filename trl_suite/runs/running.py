@@ -314,8 +314,7 @@ def _forget(path: pathlib.Path, done: int) -> None:
 def _remove(folder: pathlib.Path) -> None:
     """Removes a learner's state, and no other folder."""
     if (folder / MARK).is_file():
-        with files.folder_beside(folder) as outer:  # a killed process leaves a whole state, or none
-            os.replace(folder, pathlib.Path(outer, folder.name))
+        files.remove_folder(folder)
 
 
 @contextlib.contextmanager

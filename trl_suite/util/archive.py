@@ -12,15 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.util.files import LARGEST, check_size, read_bytes, replacing
+from trl_suite.util.files import LARGEST, check_path, check_size, read_bytes, replacing
 
 MOST_EMPTY = 10**6  # elements of an array without content
 
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-    """Writes an archive; an existing file is replaced only when the new one is complete."""
+    """Writes an archive; an existing file is replaced only when the new one is complete.
+
+    Raises:
+      ValueError: another suffix than .npz.
+      OSError: the file cannot be written.
+    """
     arrays = {name: np.asarray(value) for name, value in fields.items()}
-    with replacing(pathlib.Path(path)) as part, part.open('wb') as file:
+    with replacing(check_path(path, ('.npz',))) as part, part.open('wb') as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 

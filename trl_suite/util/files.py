@@ -41,8 +41,10 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
         _check_regular(path)
     trial = _beside(path, 'test')
     try:
-        trial.touch()
-        trial.unlink()
+        try:
+            trial.touch()
+        finally:
+            trial.unlink(missing_ok=True)
     except PermissionError:
         raise PermissionError(
             f'{path}: the folder {str(path.parent)!r} cannot be written'
@@ -194,6 +196,12 @@ def folder_beside(path: pathlib.Path) -> tempfile.TemporaryDirectory[str]:
     )
 
 
+def remove_folder(path: pathlib.Path) -> None:
+    """Removes a folder with all that is in it; a process that is killed meanwhile leaves all or none."""
+    with folder_beside(path) as outer:
+        os.replace(path, pathlib.Path(outer, path.name))
+
+
 def between(page: str, name: str, program: str, text: str) -> str:
     """Returns a page with other lines between the marks of a text that a program writes.
 
@@ -216,18 +224,17 @@ def replace_between(path: pathlib.Path, name: str, program: str, text: str) -> N
 
 
 @contextlib.contextmanager
-def locked(path: pathlib.Path, what: str, wait: bool = False) -> Iterator[None]:
+def locked(path: pathlib.Path, what: str | None = None) -> Iterator[None]:
     """Holds a lock file that names this process; a process that ends in any way releases it.
 
     Nothing is locked on systems without `fcntl`, such as Windows, and on file systems without locks.
 
     Args:
       path: the lock file; removed at the end.
-      what: what another process that has the lock does, for the message.
-      wait: whether to wait for that process.
+      what: what another process that has the lock does, for the message; None waits for that process.
 
     Raises:
-      RuntimeError: another process has the lock; the message has its number. Not with `wait`.
+      RuntimeError: another process has the lock; the message has its number.
       OSError: the file cannot be written, or is a link, or no lock file.
     """
     if fcntl is None:
@@ -236,16 +243,12 @@ def locked(path: pathlib.Path, what: str, wait: bool = False) -> Iterator[None]:
     while True:
         with _opened_lock(path) as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if what is None else fcntl.LOCK_NB))
             except BlockingIOError:
                 raise RuntimeError(f'process {file.read().strip() or "?"} {what}') from None
             except OSError:
                 pass  # the file system has no locks
-            try:
-                same = os.path.samestat(os.stat(path), os.fstat(file.fileno()))
-            except FileNotFoundError:
-                same = False
-            if not same:
+            if not _is_at(path, file):
                 continue  # the process that had the lock has just removed this file
             if not re.fullmatch(r'\d*\n?', file.read(100)):
                 raise FileExistsError(f'{path}: is no lock file; move it away')
@@ -256,8 +259,16 @@ def locked(path: pathlib.Path, what: str, wait: bool = False) -> Iterator[None]:
             try:
                 yield
             finally:
-                path.unlink(missing_ok=True)
+                if _is_at(path, file):  # and not the lock of a process that made the folder anew
+                    path.unlink(missing_ok=True)
             return
+
+
+def _is_at(path: pathlib.Path, file: TextIO) -> bool:
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _opened_lock(path: pathlib.Path) -> TextIO:
@@ -300,15 +311,14 @@ def changing(
         name: value for name, value in content.items() if not isinstance(value, (dict, list))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with locked(path.with_name(f'.{path.name}.lock'), 'changes it', wait=True):
-        before = '{}'
+    with locked(path.with_name(f'.{path.name}.lock')):
         if path.exists():
             content = read_json(path)
-            before = json.dumps(content)
+        before = json.dumps(content)
         for name, value in settings.items():
             if content.get(name) != value:
                 other = f'{name} is {content.get(name)!r}, not {value!r}'
-                raise ValueError(f'{path} has other settings: {other}; give another file')
+                raise ValueError(f'{path} has other settings: {other}; give these, or another file')
         yield content
         if json.dumps(content) != before:
             write_json(content, path, **how)

@@ -78,8 +78,9 @@ def share(value: float, count: int) -> str:
     """Returns a share of independent cases in percent, and its 95 % confidence interval (Wilson)."""
     from scipy import stats  # takes time, and few programs need it
 
-    low, high = stats.binomtest(round(value * count), count).proportion_ci(method='wilson')
-    return f'{value:.0%} ({100 * low:.0f} to {100 * high:.0f})'
+    cases = round(value * count)
+    low, high = stats.binomtest(cases, count).proportion_ci(method='wilson')
+    return f'{cases / count:.0%} ({100 * low:.0f} to {100 * high:.0f})'
 
 
 def _escaped(table: Table) -> str:
