@@ -388,7 +388,7 @@ def report(figures):
     rates = [str(n) for n in figures['rates']]
 
     def table(title, cells):
-        print(f'\n{title}\n{"":36}' + ''.join(f'{f"1/{CONTROL_RATE * int(r)}":>9}' for r in rates))
+        print(f'\n{title}\n{"":36}' + ''.join(f'{rate(r):>9}' for r in rates))
         for name, rows in figures['groups'].items():
             print(f'{name:36}' + ''.join(f'{cells(rows[r]):>9}' for r in rates))
 
@@ -410,8 +410,8 @@ def report(figures):
         )
     print('\ncoarsest accepted rate, and the bounds exceeded at the others')
     for name, rows in figures['groups'].items():
-        fails = {f'1/{CONTROL_RATE * int(r)}': rows[r]['fails'] for r in rates if rows[r]['fails']}
-        print(f'{name:36}1/{CONTROL_RATE * rows["chosen"]}', fails)
+        fails = {rate(r): rows[r]['fails'] for r in rates if rows[r]['fails']}
+        print(f'{name:36}{rate(rows["chosen"])}', fails)
     print('\nyardsticks: joints at 0.1 s (mrad), reward, mean force')
     for name, rows in figures['groups'].items():
         for case in ('perturbed', 'soft', 'default, against soft'):
@@ -488,7 +488,7 @@ def solver_table(figures):
             name,
             *(f'{1e3 * max(row[key][0] for row, _ in cases):.1f}'
               for key in ('joints 0.1 s', 'joints 0.1 s, from 1/3000 s')),
-            f'{np.count_nonzero(shares)} of {len(shares)}', tables.share(max(shares), figures['random episodes'] // 2),
+            f'{np.count_nonzero(shares)} of {len(shares)}', tables.share(np.mean(shares), len(shares) * (figures['random episodes'] // 2)),
             f'{min(times):.2f} to {max(times):.2f}',
         ))  # fmt: skip
     header = (
@@ -554,7 +554,7 @@ def plot(figures, file):
         axis.set_title(title, fontsize=10)
         axis.set_xscale('log')
         axis.set_yscale('log')
-        axis.set_xticks(steps, [f'1/{CONTROL_RATE * n}' for n in rates], fontsize=8, rotation=60)
+        axis.set_xticks(steps, list(map(rate, rates)), fontsize=8, rotation=60)
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     for axis in axes[1]:
@@ -582,6 +582,8 @@ def main():
         for name, text in blocks(files.read_json(arguments.json)).items():
             files.replace_between(arguments.page, name, 'benchmarks/physics_rate.py', text)
         return
+    if arguments.plot:
+        files.check_path(arguments.plot, ('.png', '.svg'))
     starts, episodes = (3, 2) if arguments.quick else (STARTS, RANDOM_EPISODES)
     figures = {
         'mujoco': mujoco.__version__, 'rates': RATES, 'starts': starts,

@@ -137,8 +137,9 @@ def pooled(found: dict[str, Any], id_: str, key: str) -> tuple[float, float] | N
     if not results:
         return None
     mean = sum(result['return'] for result in results) / len(results)
-    interval = math.hypot(*(result['return_interval'] or math.nan for result in results))
-    return mean, interval / len(results)
+    intervals = (result['return_interval'] for result in results)
+    half = math.hypot(*(math.nan if each is None else each for each in intervals))
+    return mean, half / len(results)
 
 
 def share(found: dict[str, Any], id_: str, key: str) -> str:
@@ -155,8 +156,9 @@ def share(found: dict[str, Any], id_: str, key: str) -> str:
     if mean is None or none is None:
         return '–'
     ratio = mean[0] / none[0]
-    half = math.hypot(mean[1], ratio * none[1]) / none[0]
-    return f'{100 * ratio:.0f}' + (f'±{100 * half:.0f}' if round(100 * ratio) < 90 else '')
+    half = math.hypot(mean[1], ratio * none[1]) / none[0]  # nan of a single episode
+    shown = round(100 * ratio) < 90 and math.isfinite(half)
+    return f'{100 * ratio:.0f}' + (f'±{100 * half:.0f}' if shown else '')
 
 
 def _shorter(id_: str) -> int:

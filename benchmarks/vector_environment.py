@@ -171,6 +171,8 @@ def main():
     parser.add_argument('--num-envs', type=int, nargs='*', default=SIZES)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
+    if arguments.plot:
+        files.check_path(arguments.plot, ('.png', '.svg'))
     figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'memory per simulation, kB': {}}
     for id_ in IDS:
         figures['single'][id_] = bench.single(id_, arguments.seconds)

@@ -198,8 +198,9 @@ def train_hierarchy(
     for i in range(QUARTERS):
         while trainer.samples * each < control_steps * (i + 1) / QUARTERS:
             trainer.learn(trainer.collect())
-        policy = trainer.exported()
-        policies.save(policy, folder / f'quarter_{i + 1}.npz')
+        path = folder / f'quarter_{i + 1}.npz'
+        policies.save(trainer.exported(), path)
+        policy = policies.load(path)  # as its digest names it
         found = evaluate_plans.run(id_, lambda _, p=policy: p, HIERARCHY_EPISODES, SEED)
         result.append({'control_steps': round(trainer.samples * each), **found})
     trainer.environments.close()
@@ -207,7 +208,8 @@ def train_hierarchy(
 
 
 def hierarchy_table(results: Results, seeds: list[int]) -> str:
-    [episodes] = {run[-1]['episodes'] for run in results.values()}
+    counts = sorted({run[-1]['episodes'] for run in results.values()})
+    episodes = ' or '.join(map(str, counts))
     rows = []
     for task, (*_, name, factor, label) in TASKS.items():
         for kind in KINDS:
@@ -215,9 +217,9 @@ def hierarchy_table(results: Results, seeds: list[int]) -> str:
             if done:
                 cells = [f'{factor * done[s][name]:.1f}' if s in done else '–' for s in seeds]
                 mean = pages.interval((factor * last[name] for last in done.values()), 1)
-                minute = ' '.join(f'{done[s]["survived_minute"]:.0%}' for s in seeds if s in done)
-                rows.append([f'{task}, {kind}: {label}', *cells, mean, minute])
-    head = ['task', *(f'seed {seed}' for seed in seeds), 'mean', 'no fall in a minute']
+                minutes = (f'{done[s]["survived_minute"]:.0%}' if s in done else '–' for s in seeds)
+                rows.append([f'{task}, {kind}: {label}', *cells, mean, ' '.join(minutes)])
+    head = ['task', *(f'seed {seed}' for seed in seeds), 'mean', 'no fall in a minute, each seed']
     title = f"{episodes} episodes of 200 s; mean of the seeds with its 95 % interval (Student's t):"
     return f'{title}\n\n{tables.markdown_table(head, rows)}'
 
@@ -276,11 +278,12 @@ def limit_table(results: Results, seeds: list[int]) -> str:
         done = of(results, f'{model}/{limits}') or (
             of(results, f'{model}/ideal') if not limited(model, limits) else {}
         )
-        values = [each['normalized_return'] for each in done.values()]
-        text = f'{np.mean(values):.2f}' if values else '–'
-        return text + (f' ± {np.std(values, ddof=1):.2f}' if len(values) > 1 else '')
+        return pages.interval((each['normalized_return'] for each in done.values()), 2)
 
-    title = f'Return divided by its maximum, mean over {LIMIT_EPISODES} episodes; ± standard deviation of the seeds:'
+    title = (
+        f'Return divided by its maximum, mean of {LIMIT_EPISODES} episodes; mean of the seeds with its '
+        "95 % interval (Student's t):"
+    )
     rows = ([limits, *(cell(model, limits) for model in MODELS)] for limits in LIMITS)
     return f'{title}\n\n{tables.markdown_table(["torque limits", *MODELS], rows)}'
 
@@ -339,7 +342,6 @@ def main() -> None:
     name, compared = arguments.comparison, COMPARISONS[arguments.comparison]
     samples = compared.samples if arguments.samples is None else arguments.samples
     checked('--samples', samples, float, above=0)
-    checked('--seeds', arguments.seeds, list[int], at_least=0)
     runs.check_seeds('--seeds', *arguments.seeds)
     path = arguments.json or arguments.runs / f'{name}.json'
     start: dict[str, Any] = {'samples': samples, 'results': {}}

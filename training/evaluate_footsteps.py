@@ -178,7 +178,7 @@ def main() -> None:
     )
     parser.add_argument('--filter', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
     parser.add_argument('--episodes', type=positive, default=100)
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=runs.TEST_SEED)
     parser.add_argument('--seconds', type=float, default=SECONDS)
     arguments = parser.parse_args()
     checked('--seconds', arguments.seconds, float, 's', at_least=LEAST_SECONDS)

@@ -140,7 +140,7 @@ def main() -> None:
     parser.add_argument('pattern', nargs='?', default='PD_Biped3D_*', help='of ids')
     parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
     parser.add_argument('--episodes', type=positive, default=EPISODES)
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=runs.TEST_SEED)
     parser.add_argument('--controller', help='id of another footstep controller')
     arguments = parser.parse_args()
     options, under = {}, ''

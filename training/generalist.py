@@ -91,11 +91,9 @@ def ids_of(character: str) -> list[str]:
     return [f'PD_{CHARACTERS[character]}_{ground}_Terrain-v0' for ground in GROUNDS]
 
 
-def evaluated(
-    chosen: dict[str, policies.Policy], episodes: int, seed: int = SEED
-) -> dict[str, dict[str, Any]]:
+def evaluated(chosen: dict[str, policies.Policy], seed: int = SEED) -> dict[str, dict[str, Any]]:
     """Evaluates in each environment the policy that is chosen for it."""
-    results = evaluation.evaluate_all(list(chosen.items()), episodes, seed, 1)
+    results = evaluation.evaluate_all(list(chosen.items()), EPISODES, seed, 1)
     return {r['id']: {key: r[key] for key in RESULTS} for r in results}
 
 
@@ -177,17 +175,17 @@ def main() -> None:
         averaged = mean_of([distilled, policy])
         found = {'distilled': distilled, 'trained': policy, 'averaged': averaged}
         made = {kind: trimmed(each) for kind, each in found.items()}
-        results = {kind: evaluated(dict.fromkeys(ids, p), EPISODES) for kind, p in made.items()}
+        results = {kind: evaluated(dict.fromkeys(ids, p)) for kind, p in made.items()}
         best = max(made, key=lambda kind: mean_score(results[kind]))
         entry = {
             'ids': ids, 'seed': arguments.seed, 'settings': dataclasses.asdict(settings),
             'machine': runs.machine(),
             'seconds': round(time.monotonic() - begin), 'curve': curve,
             'distilled_from': {id_: digest(each) for id_, each in specialists.items()},
-            'specialists': evaluated(specialists, EPISODES), **results, 'shipped': best,
+            'specialists': evaluated(specialists), **results, 'shipped': best,
             # In episodes that had no part in the choice.
-            'specialists_again': evaluated(specialists, EPISODES, OTHER_SEED),
-            'shipped_again': evaluated(dict.fromkeys(ids, made[best]), EPISODES, OTHER_SEED),
+            'specialists_again': evaluated(specialists, OTHER_SEED),
+            'shipped_again': evaluated(dict.fromkeys(ids, made[best]), OTHER_SEED),
         }  # fmt: skip
         enter(ids, made[best], entry)
         for id_ in ids:

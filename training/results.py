@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import evaluate_footsteps
+import generalist
 import numpy as np
 import oracles
 import runs
@@ -48,9 +49,8 @@ def million(samples: float) -> str:
 
 def values(found: Iterable[dict[str, Any]], key: str = 'episodes') -> str:
     """Returns the different values of results, such as '50 or 200'."""
-    return ' or '.join(
-        f'{value:g}' for value in sorted({each[key] for each in found if key in each})
-    )
+    every = sorted({each[key] for each in found if key in each})
+    return ' or '.join(f'{value:g}' if isinstance(value, float) else str(value) for value in every)
 
 
 def complete(found: dict[str, Any]) -> str:
@@ -58,7 +58,7 @@ def complete(found: dict[str, Any]) -> str:
 
 
 def environment_rows(entries: dict[str, dict[str, Any]]) -> Rows:
-    """Yields the results of the shipped policies; of several seeds, in other episodes than the choice."""
+    """Yields the results of the shipped policies, if known in other episodes than those of the choice."""
     for id_, entry in entries.items():
         if catalogue.BY_ID[id_].actuation != 'gait':
             run = train_all.shipped(entry)
@@ -117,7 +117,7 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> Rows:
 def shared_rows() -> Rows:
     """Yields the results of policies that are shipped for further environments."""
     for id_, entry in runs.read(policies.SHARED).items():
-        found = entry['evaluation']
+        found = entry.get('shipped_again', entry['evaluation'])
         low, high = found['distance_interval']
         yield [
             f'`{id_}`', f'`{entry["policy"]}`',
@@ -155,17 +155,18 @@ def generalist_rows() -> Rows:
     for path in sorted(runs.place('generalist').glob('PD_*.json')):
         entry = runs.read(f'generalist/{path.name}')
         kinds = [kind for kind in GENERALISTS if kind in entry]  # the newest kind is not in all
-        unknown, shipped = ['–'] * (len(GENERALISTS) - len(kinds)), entry['shipped']
+        unknown = ['–'] * (len(GENERALISTS) - len(kinds))
+        shipped, specialists = (
+            entry.get(f'{name}_again', entry[kind])
+            for name, kind in (('shipped', entry['shipped']), ('specialists', 'specialists'))
+        )
         for id_ in entry['ids']:
             each = {kind: entry[kind][id_] for kind in kinds}
             cells = [f'{r["normalized_return"]:.3f}, {complete(r)}' for r in each.values()]
-            part = each[shipped]['return'] / each['specialists']['return']
+            part = shipped[id_]['return'] / specialists[id_]['return']
             yield [f'`{id_}`', *cells, *unknown, f'{part:.2f}']
-        means = {
-            kind: np.mean([entry[kind][id_]['normalized_return'] for id_ in entry['ids']])
-            for kind in kinds
-        }
-        part = means[shipped] / means['specialists']
+        means = {kind: generalist.mean_score(entry[kind]) for kind in kinds}
+        part = generalist.mean_score(shipped) / generalist.mean_score(specialists)
         yield ['mean', *(f'{mean:.3f}' for mean in means.values()), *unknown, f'{part:.2f}']
 
 
@@ -233,7 +234,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
     plans = [found for each in runs.read('plans.json').values() for found in each.values()]
     flat = runs.read('transfer.json').values()
     widths = '; '.join(
-        f'of {count}: {share(0, count)}, {share(0.5, count)}'
+        f'of {count} falls, {share(0, count)} and {share(0.5, count)}'
         for count in sorted({found['falls'] for found in falls})
     )
     return [
@@ -259,10 +260,10 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             f'... five cycles before the end; the character then gets {oracles.PASSED:g} m beyond the place of '
             f'the fall, or {oracles.PASSED_CYCLES} of its mean cycles if shorter, within '
             f'{oracles.MOST_CYCLES} cycles. *Base*: every base action '
-            f'({tries["base"]}: more tries prevent more falls); *random*: '
+            f'({tries["base"]}; more of them prevent more falls); *random*: '
             f'{tries["random"]} base actions with noise; *nudged*: joint angles changed '
             f'by 0.001 rad, {tries["nudged"]} times; *any*: at any time, with its 95 % '
-            f'interval (Wilson). The other shares are of as few falls ({widths}). Where base actions prevent '
+            f'interval (Wilson). The other columns are as uncertain: {widths}. Where base actions prevent '
             'more than nudges, the selection is the limit; else falls depend on what the policy cannot observe.',
             ('environment', 'falls', 'base', 'random', 'nudged', 'any'),
             oracle_rows(),
@@ -308,8 +309,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'The same program and episodes. The policies imitate planned footsteps and the controller that tracks '
             'them; with PPO alone: [DeepLoco](reports/deeploco.md#without-hierarchy). The reward includes '
             'imitation of the clip. Goals are reached within 0.5 m instead of 1 m, and on the trail they are one '
-            'segment of 2 m ahead instead of up to ten, so that the speed towards them says little there; in soccer, '
-            'speed is towards the ball.',
+            'segment of 2 m ahead instead of up to ten, so that the speed towards them says little there.',
             PLAN_COLUMNS, plan_rows('flat_control'),
         ),
         (
@@ -332,8 +332,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         f'Policies are evaluated without noise, in {values(every)} episodes (gaits on other '
         'terrains: column *episodes*) that are used neither in training nor to select a policy of the curve. Where '
         'there are several seeds, the best one is shipped; its return is that in episodes that had no part in this choice, '
-        'beside the mean and the number of all seeds. A later run replaces the policy if its score in these episodes '
-        'is higher, so scores of environments that were trained repeatedly are slightly too high. *Return* is '
+        'beside the mean and the number of all seeds. Other policies that were chosen among runs, terrains or '
+        'kinds in the episodes of their row have slightly too high scores there. *Return* is '
         'divided by its maximum; the reward is 0 after a fall; its intervals are too narrow where '
         'falls are too rare to occur in these episodes. *Complete*: share of episodes that last to the '
         'end (256 steps; planning environments 200 s), with its 95 % interval (Wilson). *Distance*: mean, m. *Minutes*: wall time of the run, one '

@@ -52,7 +52,7 @@ def train(id_: str, seed: int, output: pathlib.Path) -> None:
     policy = trimmed(policies.load(folder / 'policy.npz'))
     entry = {
         **files.read_json(folder / 'curve.json'), 'machine': runs.machine(),
-        'shipped_at': policy.info['samples'], 'of': {'evaluations': digest(policy)},
+        'shipped_at': policy.info['samples'],
     }  # fmt: skip
     policies.save(policy, runs.place(place(id_)).with_suffix('.npz'))
     runs.write(place(id_), entry)  # last: what is entered is not trained again
@@ -63,11 +63,12 @@ def measure(id_: str) -> dict[str, Any]:
     entry = runs.read(place(id_))
     for name, variant in (('evaluations', 'randomized'), ('before', '')):
         policy = policies.reference(id_, variant)
+        own = digest(policy)
         for condition, options in CONDITIONS.items():
-            if condition not in results_of(entry, name, digest(policy)):
+            if condition not in results_of(entry, name, own):
                 result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
                 with runs.changing(place(id_)) as entry:
-                    found = results_of(entry, name, digest(policy))
+                    found = results_of(entry, name, own)
                     found[condition] = {key: result[key] for key in RESULTS}
     return entry
 

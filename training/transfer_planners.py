@@ -74,7 +74,11 @@ def main() -> None:
     training = {'controllers': ids, 'samples': arguments.samples, 'seed': arguments.seed}
     for controller in parts:
         result = evaluate_plans.run(
-            id_, lambda environments: policy, arguments.episodes, 0, controller=controller
+            id_,
+            lambda environments: policy,
+            arguments.episodes,
+            runs.TEST_SEED,
+            controller=controller,
         )
         under = how + (controller if isinstance(controller, str) else ', '.join(controller))
         print(under, evaluate_plans.shown(result), flush=True)
