@@ -35,7 +35,9 @@ def declare(commands: Any) -> None:
     )
     add_file(command, '--map', text)
     command.add_argument(
-        '--scale', type=float, help='scale of lengths; by default the ratio of limb lengths'
+        '--scale',
+        type=float,
+        help='factor on lengths; by default the ratio of limb lengths, or of roots of clips',
     )
     text = 'cut one cycle, between two times (s), or without times the best cycle that is found'
     command.add_argument('--cycle', nargs='*', type=float, metavar='TIME', help=text)

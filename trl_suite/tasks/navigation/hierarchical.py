@@ -185,9 +185,9 @@ class HierarchicalNavigation(GoalTask):
                 "one, or with the interface 'frame' exactly one"
             )
         longest = rules.LONGEST * CONTROL_TIMESTEP
-        if steps.duration > longest:
+        if by_plan and steps.duration > longest:
             raise ValueError(
-                f'{steps.name}: a step takes {steps.duration:g} s; expected at most {longest:g} s'
+                f'{steps.name}: a footstep takes {steps.duration:g} s; expected at most {longest:g} s'
             )
         if by_plan:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
