@@ -1,7 +1,6 @@
 """Programs that use the suite through other libraries: the examples run with expected results."""
 
 import importlib
-import importlib.util
 import math
 import pathlib
 import re
@@ -35,11 +34,21 @@ FLAT, GAPS = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0'
 
 def needs(module, extra):
     """Skips a class of tests where the extra is not installed."""
-    try:
-        importlib.import_module(module)
-    except ImportError:
-        return unittest.skip(f"needs {module}: pip install 'trl_suite[{extra}]'")
-    return lambda tested: tested
+
+    def decorated(tested):
+        begin = tested.setUpClass
+
+        def set_up_class(_):
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                raise unittest.SkipTest(f"{error}: pip install 'trl_suite[{extra}]'") from None
+            begin()
+
+        tested.setUpClass = classmethod(set_up_class)
+        return tested
+
+    return decorated
 
 
 def run_page(word):
@@ -98,6 +107,9 @@ class ExamplesTest(absltest.TestCase):
     def test_actuators(self):
         out = run_example('real_actuators', '--episodes', '1')
         self.assertEqual([line.split()[0] for line in out.splitlines()], REALISTIC)
+        shares = [float(line.split()[3]) for line in out.splitlines()]
+        self.assertGreater(shares[0], 0.9)  # with ideal motors
+        self.assertBetween(min(shares), 0.05, shares[0])
 
 
 @needs('torchrl', 'torchrl')

@@ -169,10 +169,8 @@ class DoctorTest(CommandTest):
             mock.patch.object(doctor, '_end', lambda code: ends[code]),
         ):
             found = list(doctor.findings())
-        self.assertEqual(
-            [each.text for each in found if each.state == doctor.FAILED],
-            ['no environment runs: no engine'],
-        )
+        failed = [each.text for each in found if each.state == doctor.FAILED]
+        self.assertIn('no environment runs: no engine', failed)
         text = '\n'.join(each.text for each in found)
         for name in ('Python 3', 'mujoco ', "extra 'video'", ' cores usable', 'MUJOCO_GL=osmesa'):
             self.assertIn(name, text)
