@@ -304,7 +304,7 @@ def limit_panels(results: Results) -> dict[str, dict[str, list[Any]]]:
 COMPARISONS = {
     'actions': of_gaits(32768, DOG, ACTIONS, train_actions),
     'changes': of_gaits(
-        98304, CHANGED, {cell: name for cell, (name, _) in CHANGES.items()}, train_changes
+        65536, CHANGED, {cell: name for cell, (name, _) in CHANGES.items()}, train_changes
     ),
     'hierarchy': Comparison(
         1.2e6, tuple(f'{task}/{kind}' for task in TASKS for kind in KINDS), train_hierarchy,
