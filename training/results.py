@@ -150,10 +150,9 @@ def fall_rows() -> Rows:
             yield [f'`{id_}`', str(found['falls']), f'{seconds:g}', *shares]
 
 
-def generalist_rows() -> Rows:
+def generalist_rows(entries: Iterable[dict[str, Any]]) -> Rows:
     """Yields the results of the policies for all terrains of a character, and of its specialists."""
-    for path in sorted(runs.place('generalist').glob('PD_*.json')):
-        entry = runs.read(f'generalist/{path.name}')
+    for entry in entries:
         kinds = [kind for kind in GENERALISTS if kind in entry]  # the newest kind is not in all
         unknown = ['–'] * (len(GENERALISTS) - len(kinds))
         shipped, specialists = (
@@ -226,9 +225,8 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
         for kind in ('base', 'random', 'nudged')
     }
     tracking = runs.read('oracle_falls.json').values()
-    generalists = [
-        runs.read(f'generalist/{path.name}') for path in runs.place('generalist').glob('PD_*.json')
-    ]
+    paths = sorted(runs.place('generalist').glob('PD_*.json'))
+    generalists = [runs.read(f'generalist/{path.name}') for path in paths]
     of_terrains = [found for entry in generalists for found in entry['specialists'].values()]
     footsteps = runs.read('footsteps.json').get(evaluate_footsteps.ID, {}).values()
     plans = [found for each in runs.read('plans.json').values() for found in each.values()]
@@ -284,7 +282,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'after PPO on all terrains, and of the mean weights of both. *Share*: that of the best one, which is '
             'shipped, divided by that of the specialist.',
             ('environment', 'specialist', 'distilled', 'after PPO', 'mean weights', 'share'),
-            generalist_rows(),
+            generalist_rows(generalists),
         ),
         (
             'Footstep tracking',

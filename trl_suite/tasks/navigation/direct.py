@@ -151,9 +151,9 @@ def advance_all(env_ids: np.ndarray, data: DirectData) -> int:
         if proceed(i, tracking):
             store_trace(i, steps[i], measurement, aims.goals)
             if aims.with_ball:
-                seconds, outcome = CONTROL_TIMESTEP, tracking.outcome
-                speed = dribble(i, seconds, data.physics, measurement, aims, outcome)
-                aims.goals.speed[i] = speed
+                aims.goals.speed[i] = dribble(
+                    i, CONTROL_TIMESTEP, data.physics, measurement, aims, tracking.outcome
+                )
             wanted += test_goal(i, steps[i], measurement, aims)
     return wanted
 
