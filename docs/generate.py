@@ -42,8 +42,11 @@ NAMES = (  # parts of ids
         '`PD`, `Vel`, `Torque`, `MTU`',
         'actuation: position (proportional-derivative control), velocity, torque, muscle (muscle-tendon units)',
     ),
-    ('`Imitate`, `LLC_Imitate`', 'imitation: a clip is tracked; LLC: low-level controller'),
-    ('`LLC_…_Step`', 'footstep tracking'),
+    (
+        '`Imitate`, `LLC_Imitate`',
+        'imitation: a clip is tracked; LLC: low-level controller; `Imitate-Steps`: over low boxes',
+    ),
+    ('`LLC_…_Step`, `Run_FootStep`, `FULL_Imitate-Steps`', 'footstep tracking'),
     ('`HLC`', 'high-level controller: plans footsteps for a low-level controller'),
     ('`Hard`', 'the same tasks without hierarchy: the policy controls the joints'),
     ('`FULL`', 'the three-dimensional biped with arms and head'),
