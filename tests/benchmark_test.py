@@ -297,6 +297,7 @@ class ReportCommandTest(CommandTest):
         with mock.patch.object(evaluation, 'evaluate_all', scores):
             benchmark.run(ID, learner(benchmark.get(ID), 0), 60, folder / 'a.json')
         out = self.output('benchmark', 'report', 'Nothing', '--json', 'report.json')
+        self.assertRegex(out, r'\n1 of 1 results: not comparable: budget is 60')
         self.assertRegex(out, r'Nothing \| 1 \| 0\.500 \| 0\.500 \|')
         found = json.loads(pathlib.Path('report.json').read_text())
         self.assertEqual(found['environments'], [ID])

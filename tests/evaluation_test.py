@@ -172,6 +172,9 @@ class EvaluateTest(parameterized.TestCase):
         found = evaluation.evaluate(GAPS, make(GAPS), 4, task_kwargs={'time_limit': 0.1})
         self.assertEqual((found['step_limit'], found['lengths']), (3, [3] * 4))
         self.assertEqual(found['normalized_return'], found['return'] / 3)
+        # Rounded up by less than a physics step, within which episodes end.
+        found = evaluation.evaluate(GAPS, make(GAPS), 1, task_kwargs={'time_limit': 0.1 + 5e-7})
+        self.assertEqual((found['step_limit'], found['lengths']), (3, [3]))
         with self.assertRaisesRegex(
             ValueError, 'expected a step_limit.* since steps of FSM_.* differ'
         ):

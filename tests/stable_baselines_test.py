@@ -1,5 +1,6 @@
 """Stable-Baselines3's interface, against its own vector environment of single ones."""
 
+import gc
 import importlib.util
 import unittest
 
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
 from trl_suite.environments import arguments
 from trl_suite.gym import SuiteEnv
+from trl_suite.runs import Course, Stage, train_seeds
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -135,6 +137,30 @@ class StableBaselinesTest(parameterized.TestCase):
         np.testing.assert_array_equal(wrapped.reset(), own.reset())
         with self.assertRaisesRegex(ValueError, "autoreset is 'disabled'; expected 'same_step'"):
             SuiteVecEnv(VectorEnvironment(GAPS, 2, autoreset='disabled'))
+
+    def test_a_wrapper_that_is_forgotten_closes_nothing(self):
+        made = VectorEnvironment(GAPS, 1, 1, autoreset='same_step')
+        SuiteVecEnv(made).reset()
+        gc.collect()
+        made.step(np.zeros((1, len(made.action_map))))
+
+    def test_info_of_arrays(self):
+        envs = SuiteVecEnv(GAPS, 2, 1, task_kwargs={'sensors': 'mild'})
+        envs.reset()
+        *_, (first, second) = envs.step(np.zeros((2, *envs.action_space.shape)))
+        clean = envs.environment.info['clean_observation']
+        np.testing.assert_array_equal(
+            [each['clean_observation'] for each in (first, second)], clean
+        )
+        self.assertFalse(np.shares_memory(first['clean_observation'], clean))
+
+    def test_ppo_in_a_stage(self):
+        """It seeds the simulations, with training seeds."""
+        stage = Stage(Course('one', (GAPS,)), 0, 100)
+        envs = SuiteVecEnv(stage.environments(2, autoreset='same_step', dtype=np.float32))
+        PPO('MlpPolicy', envs, n_steps=8, batch_size=16, seed=5, device='cpu').learn(16)
+        self.assertEqual(stage.left, 100 - 16)
+        self.assertEqual(envs.environment.seeds.tolist(), train_seeds(2, 5))
 
     def test_ppo_runs(self):
         envs = VecNormalize(VecMonitor(SuiteVecEnv(GAPS, 4, 1, flat_observation=False)))

@@ -18,6 +18,7 @@ import numpy as np
 import tqdm
 
 import trl_suite.suite  # noqa: F401  tells what to install if dm_control is missing
+from trl_suite.environments.core import TIME_ERROR
 from trl_suite.environments.named_policies import BatchPolicy
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
@@ -188,7 +189,9 @@ def _run(
                     f'time_limit is {environments.time_limit}; expected a step_limit, by which returns '
                     f'are divided, since steps of {id_} differ in duration'
                 )
-            steps = math.ceil(environments.time_limit / environments.control_timestep - 1e-6)
+            steps = math.ceil(
+                (environments.time_limit - TIME_ERROR) / environments.control_timestep
+            )
             steps = max(1, steps)  # an episode ends after a step
             step_limit = steps if step_limit is None else min(step_limit, steps)
         if step_limit is None:

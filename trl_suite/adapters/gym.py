@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from trl_suite import rendering, suite
+from trl_suite.bodies.reference import PHASE
 from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.vector import VectorEnvironment
@@ -44,7 +45,7 @@ except ImportError as error:
     raise ImportError(message) from None
 
 METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most ids
-BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; others are unbounded
+BOUNDS = {(PHASE.name, PHASE.size): (0.0, 1.0)}  # of observation blocks; others are unbounded
 RENDER_OPTIONS = tuple(inspect.signature(rendering.frame).parameters)[1:]
 _ONE_OBJECT = 'simulations share one object'
 Info = dict[str, Any]
@@ -110,13 +111,14 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         if seed is not None:
             arguments.check_seed('seed', stream)
             seed = int(seed)
-        if level is not None:
-            self.environment.task.choose_level([0], level)
-        if seed is not None:  # after all checks
-            self.environment.random_state.seed(stream)
-            self.environment.core.seeds[0] = stream
-        super().reset(seed=seed)
-        time_step = self.environment.reset()
+        with self.environment.core as core:
+            if level is not None:
+                core.task.choose_level([0], level)
+            if seed is not None:  # after all checks
+                self.environment.random_state.seed(stream)
+                core.seeds[0] = stream
+            super().reset(seed=seed)
+            time_step = self.environment.reset()
         return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
@@ -214,10 +216,13 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             if None in seeds:
                 known = np.array([each is not None for each in seeds])
                 seeds = arguments.all_seeds([each or 0 for each in seeds], self.num_envs).tolist()
-                if level is not None:  # raises before anything changes
-                    self.environment.task.choose_level(np.flatnonzero(env_ids), level)
-                self.environment.seed(seeds, env_ids & known)
-                seeds = level = None
+                with self.environment.core as core:  # whose errors come before anything changes
+                    if core.fresh and not env_ids.all():
+                        raise ValueError('the first reset must be of all simulations')
+                    if level is not None:
+                        core.task.choose_level(np.flatnonzero(env_ids), level)
+                    self.environment.seed(seeds, env_ids & known)
+                    seeds = level = None
         observation = self.environment.reset(env_ids, seeds, level)
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         return observation, masked(flat(self.environment.info), env_ids)
@@ -272,6 +277,9 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         """Frees the simulations."""
         self.environment.close()
 
+    def __del__(self) -> None:
+        """Closes nothing, unlike Gymnasium 1.2: the wrapped environment may be in use elsewhere."""
+
 
 def metadata(task: Any) -> Info:
     """Metadata of rendering; one frame per step plays in real time, except for gait cycles."""
@@ -314,12 +322,12 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
 
 def spaces_of(
     environment: Environment | VectorEnvironment,
-    shapes: Mapping[str, tuple[int, ...]],
+    shapes: Mapping[str, tuple[int]],
     flat: bool,
     dtype: Any,
 ) -> tuple[spaces.Space[Any], spaces.Box]:
     """Returns the spaces of one simulation: blocks of these shapes, flat or not; actions in [-1, 1]."""
-    bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
+    bounds = {name: BOUNDS.get((name, *shape), (-np.inf, np.inf)) for name, shape in shapes.items()}
     # Pairs, as Dict would sort the keys of a dict.
     blocks = spaces.Dict([(n, spaces.Box(*bounds[n], s, dtype)) for n, s in shapes.items()])
     actions = spaces.Box(-1.0, 1.0, (len(environment.action_map),), dtype)

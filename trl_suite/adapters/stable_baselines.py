@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from trl_suite.adapters.gym import SuiteVectorEnv, flat
-from trl_suite.environments import arguments
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import errors
@@ -79,26 +78,25 @@ class SuiteVecEnv(VecEnv):
         self.metadata = view.metadata
 
     def seed(self, seed: int | None = None) -> list[int]:
-        """Sets the seeds for the next reset; they are derived from one as in the constructor.
+        """Reseeds all simulations, whose seeds are derived from one as in the constructor.
 
         Successive seeds have no episodes in common, as they would with the seeds s + i that
         Stable-Baselines3 gives to environments of its own.
         """
-        seeds: list[int] = arguments.all_seeds(seed, self.num_envs).tolist()
-        self._seeds = [*seeds]
+        self.environment.seed(seed)
+        seeds: list[int] = self.environment.seeds.tolist()
         return seeds
 
     def reset(self) -> Any:
         """Starts an episode in every simulation; `set_options` may have set its 'level'."""
-        seeds = [seed for seed in self._seeds if seed is not None] or None
         for options in self._options:
             errors.check_known('option of reset', ('level',), *options)
         levels = {i: each['level'] for i, each in enumerate(self._options) if 'level' in each}
-        if levels:
-            self.environment.task.choose_level([*levels], [*levels.values()])
-        self._reset_seeds()
+        with self.environment.core as core:
+            if levels:
+                core.task.choose_level([*levels], [*levels.values()])
+            observation = self.environment.reset()
         self._reset_options()
-        observation = self.environment.reset(seed=seeds)
         self.reset_infos = rows_of(flat(self.environment.info))
         return observation
 
@@ -145,8 +143,8 @@ class SuiteVecEnv(VecEnv):
 
 
 def rows_of(info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Converts a dict of arrays of n simulations to n dicts of Python values."""
-    columns = (value.tolist() for value in info.values())
+    """Converts a dict of arrays of n simulations to n dicts of Python numbers, and of arrays."""
+    columns = (each.tolist() if each.ndim == 1 else list(each.copy()) for each in info.values())
     return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
 
 

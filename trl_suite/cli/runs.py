@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import collections
 import contextlib
 import importlib
 import inspect
@@ -18,6 +19,8 @@ from trl_suite.cli import engine
 from trl_suite.cli.arguments import add_command, add_file, add_threads, positive
 from trl_suite.util import errors, files, program
 from trl_suite.util.options import checked
+
+COMPARABLE = 'comparable'
 
 
 def declare(commands: Any) -> None:
@@ -207,7 +210,7 @@ def _check(arguments: argparse.Namespace) -> None:
 def _comparable(benchmark: Any, result: dict[str, Any]) -> str:
     """Returns whether a result has the settings of the benchmark, in words."""
     notes = benchmark.departures(result)
-    return f'not comparable: {"; ".join(notes)}' if notes else 'comparable'
+    return f'not comparable: {"; ".join(notes)}' if notes else COMPARABLE
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -222,6 +225,11 @@ def _report(arguments: argparse.Namespace) -> None:
     results = [result for _, result in _read(benchmark, arguments.entries)]
     found = report.report(results)
     print('\n'.join(map(program.printable, report.table(found).split('\n'))))
+    for note, count in collections.Counter(
+        _comparable(benchmark, each) for each in results
+    ).items():
+        if note != COMPARABLE:
+            print(program.printable(f'{count} of {len(results)} results: {note}'))
     if arguments.json is not None:
         files.write_json(found, arguments.json)
 

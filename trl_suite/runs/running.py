@@ -272,7 +272,7 @@ class Benchmark(results.Format):
         """Returns the result so far, and restores the learner if the run has not ended."""
         result = self.read(path, complete=False)
         unfinished = len(result['scores']) < stages
-        for name in (*self.settings, 'mujoco', *(['trl_suite'] if unfinished else ())):
+        for name in (*self.settings, *(('mujoco', 'trl_suite') if unfinished else ())):
             if result.get(name, expected[name]) != expected[name]:
                 raise ValueError(
                     f'{path} holds another run: {name} is {result[name]}; expected {expected[name]}'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Mapping
 from collections.abc import Sequence as Numbers
 from typing import Any
@@ -49,6 +50,7 @@ class Stage:
         self._course, self._num_threads = course, num_threads
         self._made = itertools.count()
         self._over = False
+        self._counting = threading.Lock()  # environments of a stage may run in several threads
         self._returns: list[tuple[int, float]] = []  # samples at the end of an episode, and score
 
     @property
@@ -94,16 +96,22 @@ class Stage:
         Raises:
           BudgetExceededError: more than are left, or after the end of the stage; none are counted.
         """
-        if self._over:
-            raise BudgetExceededError(
-                f'stage {self.number} ({self.id}) has ended; expected steps in train only'
-            )
-        if count > self.left:
-            raise BudgetExceededError(
-                f'stage {self.number} ({self.id}): {count} more samples; expected at most '
-                f'{self.left}, since {self.budget - self.left} of {self.budget} are taken'
-            )
-        self.samples[task] += count
+        with self._counting:
+            if self._over:
+                raise BudgetExceededError(
+                    f'stage {self.number} ({self.id}) has ended; expected steps in train only'
+                )
+            if count > self.left:
+                raise BudgetExceededError(
+                    f'stage {self.number} ({self.id}): {count} more samples; expected at most '
+                    f'{self.left}, since {self.budget - self.left} of {self.budget} are taken'
+                )
+            self.samples[task] += count
+
+    def refund(self, task: int, count: int) -> None:
+        """Takes back what `spend` has counted, of a step that failed."""
+        with self._counting:
+            self.samples[task] -= count
 
     def finish(self) -> None:
         """Ends the stage: its simulations refuse further steps."""
@@ -144,7 +152,7 @@ class _Counted(VectorEnvironment):
         try:
             step = super().step(action, env_ids)
         except BaseException:
-            self._stage.samples[self._number] -= asked
+            self._stage.refund(self._number, asked)
             raise
         self.sums += step.reward
         ended = step.terminated | step.truncated
@@ -184,8 +192,14 @@ class _Counted(VectorEnvironment):
     def copy_from(
         self, other: VectorEnvironment, other_ids: Numbers[int], env_ids: Numbers[int]
     ) -> None:
-        super().copy_from(other, other_ids, env_ids)
+        """Copies states as `VectorEnvironment.copy_from`.
+
+        Raises:
+          ValueError: a simulation that is copied has a seed for tests.
+        """
         ids, sources = given_ids(env_ids, self.num_envs), given_ids(other_ids, other.num_envs)
+        _check_training(other.seeds[sources])
+        super().copy_from(other, other_ids, env_ids)
         self.sums[ids] = other.sums[sources] if isinstance(other, _Counted) else np.nan
 
 
