@@ -409,6 +409,19 @@ class ObservableTest(parameterized.TestCase):
                 each.validate(step.observation[name])
             step = environment.step(action)
 
+    def test_a_restored_state_has_its_random_stream(self):
+        task = suite.build_task(suite.find(GAPS))
+        noisy = observable.Generic(
+            lambda _: 0.0, corruptor=lambda _, random_state: random_state.rand()
+        )
+        task.character.observables.add_observable('noise', noisy)
+        environment = Environment(task, random=7)
+        environment.reset()
+        state, stream = environment.get_state(), environment.random_state.get_state()
+        environment.set_state(state)
+        for found, expected in zip(environment.random_state.get_state(), stream, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
     def test_returned_observations_are_not_overwritten(self):
         environment = suite.make(GAPS, {'random': 0})
         first = environment.reset().observation
@@ -475,11 +488,29 @@ class HookTest(parameterized.TestCase):
         environment.reset()
         environment.step(np.zeros(6))
         self.assertEqual(calls, ['reset', 'after_step'])
+        hooked = suite.make(GAPS)
+        hooked.add_extra_hook('after_step', print)
+        with self.assertRaisesRegex(
+            TypeError, 'hooks of add_extra_hook, which a pickle would lack'
+        ):
+            pickle.dumps(hooked)
         for name in 'initialize_episode_mjcf', 'after_compile':
             with self.assertRaisesRegex(
                 ValueError, f'{name} hook: the model is compiled once.*before_step'
             ):
                 environment.add_extra_hook(name, print)
+
+    @parameterized.parameters('PD_Biped2D_Slopes_Terrain-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0')
+    def test_a_hook_may_move_the_character_far_away(self, id_):
+        def move(physics, _):
+            physics.data.qpos[0] = 40.0
+
+        environment = suite.make(id_, {'random': 1})
+        environment.add_extra_hook('initialize_episode', move)
+        height = environment.reset().observation['pose'][0]
+        ground, (x, y, z) = environment.task.arena.grounds[0], parts.root(environment.task)[0]
+        below = ground.height(x, y) if '3D' in id_ else ground.height(x)
+        self.assertAlmostEqual(height, z - below, delta=0.02)
 
     def test_methods_of_a_task(self):
         """They are called, or refused; a vector environment calls none."""
@@ -587,15 +618,21 @@ class ConstructionTest(parameterized.TestCase):
         bad = [
             *(({'step_limit': value}, whole) for value in (2.5, np.inf, *common)),
             *(({'time_limit': value}, time) for value in (None, *common)),
+            ({'random': np.random.RandomState(np.random.PCG64(1))}, 'a RandomState of PCG64; expected'),
             ({'random': -1}, 'random is -1'), ({'random': 2**32}, 'random is 4294967296'),
         ]  # fmt: skip
-        assert_refused(self, *((lambda o=o: suite.make(GAPS, o), message) for o, message in bad))
+        assert_refused(
+            self, *((lambda o=o: suite.make(GAPS, o), message) for o, message in bad),
+            (lambda: suite.make(GAPS, {'time_limit': 5}, {'time_limit': 3}), 'time_limit is in task_kwargs and'),
+        )  # fmt: skip
         for seed in (True, 1.0, '1', b'1', np.random.default_rng(1)):
             with self.assertRaisesRegex(TypeError, r'random is .*; expected a seed, an integer'):
                 suite.make(GAPS, {'random': seed})
 
     def test_images_show_the_reward(self):
         """The body turns green with the fourth power of the reward; the ground does not."""
+        shown = suite.load('plaid', 'biped_gaps', {'random': 1}, {'visualize_reward': True})
+        self.assertIsNotNone(shown._colours)
         environment = suite.load('plaid', 'biped_gaps', {'random': 1}, visualize_reward=True)
         environment = pickle.loads(pickle.dumps(environment))
         environment.reset()

@@ -834,7 +834,7 @@ class Rise(Walk):
 
     def finish_step(self, env_ids):
         super().finish_step(env_ids)
-        self.reward[env_ids] = parts.height(self)[env_ids]
+        self.reward[env_ids] = parts.root(self)[env_ids, 2]
 
 
 class TaskTest(parameterized.TestCase):

@@ -525,6 +525,7 @@ class DivergenceTest(parameterized.TestCase):
         environment.reset()
         state, data = environment.get_state(), environment.physics.data
         kept, idle = environment.observation(), np.zeros(len(environment.action_map))
+        place = environment.info['distance']
         expected = environment.step(idle)
         for field, value in BROKEN:
             with self.subTest(field=field, value=value):
@@ -535,6 +536,7 @@ class DivergenceTest(parameterized.TestCase):
                 self.assertTrue(step.last() and step.discount == 0 and step.reward == 0)
                 self.assertTrue(environment.info['diverged'] and not environment.info['fell'])
                 np.testing.assert_equal(step.observation, kept)  # the last that was sound
+                self.assertEqual(environment.info['distance'], place)
                 self.assertTrue(environment.step(idle).first())
                 environment.set_state(state)
                 step = environment.step(idle)
@@ -544,6 +546,7 @@ class DivergenceTest(parameterized.TestCase):
                 environment.set_state(broken)
                 for value in environment.step(idle).observation.values():
                     self.assertTrue(np.isfinite(value).all())
+                self.assertTrue(np.isfinite(environment.info['distance']))
                 environment.reset()
                 self.assertFalse(environment.step(idle).last())
 

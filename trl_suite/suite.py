@@ -65,7 +65,8 @@ def load(
     errors.check_known('domain', TASKS_BY_DOMAIN, domain_name)
     errors.check_known(f'task of domain {domain_name!r}', TASKS_BY_DOMAIN[domain_name], task_name)
     environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
-    environment_kwargs['visualize_reward'] = visualize_reward
+    if visualize_reward:
+        environment_kwargs['visualize_reward'] = True
     spec = catalogue.BY_TASK[domain_name, task_name]
     return build_environment(spec, task_kwargs, environment_kwargs)
 
@@ -142,7 +143,7 @@ def combine(
         'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
         needs neither clip nor controller. Or a custom `TaskType`; or a class or function that is
         called as task(character, arena, actuation_model=...), with clip=... if one is given, and
-        with the task's options as keyword arguments, and returns a `Task`.
+        with the task's options that it names as keyword arguments, and returns a `Task`.
       clip: the reference motion. For imitation: name of a clip, path of an .npz, or a `Clip`; for
         footsteps in three dimensions: name or path of a library of footsteps, or a
         `FootstepLibrary`. By default the character's own. The tasks 'gait' and 'walk' have no
@@ -255,6 +256,10 @@ def build_environment(
     of_task = task_kwargs.copy()
     for name in _ENVIRONMENT_OPTIONS:
         if name in of_task:
+            if name in environment_kwargs:
+                raise ValueError(
+                    f'{name} is in task_kwargs and in environment_kwargs; expected it once'
+                )
             options[name] = of_task.pop(name)
     environment = Environment(build_task(spec, of_task), **options)
     environment.recipe = (build_environment, (spec, task_kwargs, environment_kwargs))

@@ -79,6 +79,10 @@ class Environment(composer.Environment):
         self.step_limit, time_limit = arguments.limits(step_limit, time_limit)
         if isinstance(random, (int, float, str, bytes, np.random.Generator)):
             arguments.check_seed('random', random)
+        if isinstance(random, np.random.RandomState):
+            kind = random.get_state(legacy=False)['bit_generator']
+            if kind != 'MT19937':
+                raise ValueError(f'random is a RandomState of {kind}; expected one of MT19937')
         checked('flat_observation', flat_observation, bool)
         checked('visualize_reward', visualize_reward, bool)
         self._flat_observation = flat_observation
@@ -106,12 +110,13 @@ class Environment(composer.Environment):
         called = hooks.called(task)
         self._hooked = 'before_step' in called or 'after_step' in called
         self._begun_by_hooks = 'initialize_episode' in called
+        self._extra_hooks = False
 
     def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
         self.core.usable()
         hooks.check_extra(hook_name)
         super().add_extra_hook(hook_name, hook_callable)
-        self._hooked = self._begun_by_hooks = True
+        self._hooked = self._begun_by_hooks = self._extra_hooks = True
 
     def _make_observation_updater(self) -> composer_observation.Updater:
         # Of a user's own observables; with one substep, it counts a control step as a single update.
@@ -269,18 +274,26 @@ class Environment(composer.Environment):
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the same actions then give bit-identical results.
 
-        Errors are those of `VectorEnvironment.set_state`.
+        Buffers of users' observables are not part of it, and begin as at a reset. Errors are those of
+        `VectorEnvironment.set_state`.
         """
         with self.core as core:
             core.set_state(state)
             if self._has_own_observables:
+                stream = self._random_state.get_state()
                 self._observation_updater.reset(self._physics_proxy, self._random_state)
+                self._random_state.set_state(stream)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.recipe is None:
             raise TypeError(
                 'this environment was not made by trl_suite.suite, so it cannot be rebuilt from a '
                 'pickle; pickle env.get_state() instead'
+            )
+        if self._extra_hooks:
+            raise TypeError(
+                'this environment has hooks of add_extra_hook, which a pickle would lack; pickle '
+                'env.get_state() instead'
             )
         build, arguments = self.recipe
         return build, arguments, self.get_state()

@@ -362,6 +362,8 @@ class Task(composer.Task):
         if all(map(np.array_equal, self._begun, (world.qpos, world.qvel))):
             return
         world.forward(ids)
+        if 'body' in vars(self):
+            self.body.recentre(ids)
         self.observe(ids)
         self.outcome.reward_terms[ids] = 0.0  # `observe` may have written those of the start
         for component in self.components:

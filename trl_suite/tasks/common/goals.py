@@ -457,8 +457,10 @@ class GoalTask(BodyTask):
             goal = self.arena.goal(i, random, place, self.RULE)
         else:
             x, y = place + random_displacement(random, *distance)
-            height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
-            goal = np.array([x, y, height[0, 0]])
+            ground = self.arena.grounds[i]  # also beyond the window
+            assert ground is not None
+            height = float(ground.height(x, y))
+            goal = np.array([x, y, height if math.isfinite(height) else 0.0])
         self.goals.place[i] = goal
         lasts = random.uniform(*GOAL_LASTS)
         self.goals.due[i] = self.clock.steps[i] + round(lasts / CONTROL_TIMESTEP)

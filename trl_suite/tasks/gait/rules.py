@@ -72,6 +72,7 @@ class GaitTaskState(NamedTuple):
       down: decaying average of samples with a fall link on the ground.
       milestone: x and z of the root at the last test of progress, (n, 2) m.
       fell, stuck: whether the episode has ended with a fall, or without progress.
+      distance: x of the root, m; of a diverged episode the last that was observed.
       duration, stumbling: `lasted` and `stumbled` of the last finished step, s.
     """
 
@@ -85,6 +86,7 @@ class GaitTaskState(NamedTuple):
     milestone: np.ndarray = POINT
     fell: np.ndarray = FLAG
     stuck: np.ndarray = FLAG
+    distance: np.ndarray = REAL
     duration: np.ndarray = REAL
     stumbling: np.ndarray = REAL
 
@@ -241,6 +243,7 @@ def observe(i: int, data: GaitTaskData) -> None:
     """Writes the observation, with the stance leg first."""
     ids, physics = data.body.ids, data.body.physics
     measured, observation = data.body.observation, data.outcome.observation
+    data.state.distance[i] = physics.qpos[i, ids.qpos[0]]
     measure(i, data.body)
     observe_body(i, data.body.columns, data.body, measured)
     stance = data.gait.state.stance[i]

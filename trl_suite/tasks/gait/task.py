@@ -142,7 +142,7 @@ class GaitTask(Task):
         body.bind(world, self._torques, measured, body.blocks)
         gait.bind(world)
         self.state = allocated(rules.GaitTaskState, n, action=np.zeros(len(self.action_map)))
-        self._allocate(n, world.qpos[:, body.pose_qpos[0]])
+        self._allocate(n, self.state.distance)
         self.saved = (self.state, gait.state, self.outcome)
         self.info_arrays |= {
             'fell': self.state.fell,  # `outcome.fell` includes `stuck`

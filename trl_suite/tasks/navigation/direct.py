@@ -172,10 +172,11 @@ def finish_all(env_ids: np.ndarray, data: DirectData) -> None:
 
 @compiled
 def observe_all(env_ids: np.ndarray, data: DirectData) -> None:
-    """Writes distances, reward terms of the current state, and observations."""
+    """Writes distances, where a step begins, reward terms of the current state, and observations."""
     for i in env_ids:
         tracking = data.tracking
         write_distance(i, tracking.along, tracking.measurement, tracking.travel)
+        store_start(i, data.physics, tracking.measurement, data.aims)
         compare(i, data)
         observe(i, data)
 
@@ -249,9 +250,6 @@ class DirectNavigation(GoalTask, TrackingTask):
 
     def _placed(self, env_ids: np.ndarray) -> None:
         self._begin_goals(env_ids)
-        if self.ball:
-            self.ball.state.begin[env_ids] = self.ball.place[env_ids]
-        self.goals.walker[env_ids] = self.body.measure(env_ids).com[env_ids]
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.body.measure(env_ids, stepped=True)

@@ -37,7 +37,6 @@ NAVIGATION_TERMS = (
     Term('upright', UPRIGHT, '1'),
 )
 SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
-LONGEST = 60  # limit of control steps per step; the clock switches stance long before
 
 
 class PlanningState(NamedTuple):
@@ -99,13 +98,6 @@ class PlanningData(NamedTuple):
 
 
 @compiled
-def measure_walker(i: int, data: PlanningData) -> None:
-    """Measures the body and its distance from the start."""
-    measure(i, data.body)
-    write_distance(i, False, data.body.measurement, data.travel)
-
-
-@compiled
 def lay_plan(i: int, action: np.ndarray, data: PlanningData) -> None:
     """Sets the plan from the action, relative to the root and its heading, if a footstep begins.
 
@@ -155,17 +147,16 @@ def finish_control_step(i: int, data: PlanningData) -> bool:
     if data.outcome.diverged[i]:
         outcome.failed[i] = state.over[i] = True
         return False
-    measure_walker(i, data)
     count, measurement = data.clock.steps[i], body.measurement
+    measure(i, body)
+    write_distance(i, False, measurement, data.travel)
     if count % SAMPLE_FRAMES == 0:
         sample_fall(i, measurement.fallen[i], state.down)
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, data.clock.phase[i], measurement, plan):
         plan.landed[i] = True
     store_trace(i, count, measurement, data.aims.goals)
-    state.over[i] = (
-        plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST or not data.by_plan
-    )
+    state.over[i] = plan.landed[i] or outcome.failed[i] or not data.by_plan
     if not state.over[i]:
         observe_for_controller(i, data)
     return not state.over[i]
@@ -218,7 +209,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
     """Sets plans where footsteps begin, and writes the footstep controller's observations."""
     body, state = data.body, data.state
     for i in env_ids:
-        measure_walker(i, data)  # a restored state has no measurement
+        measure(i, body)  # a restored state has no measurement
         lay_plan(i, action, data)
         state.lasted[i] = 0
         store_start(i, body.physics, body.measurement, data.aims)
@@ -230,7 +221,7 @@ def begin_steps(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> 
 def show_plans(env_ids: np.ndarray, action: np.ndarray, data: PlanningData) -> None:
     """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
-        measure_walker(i, data)
+        measure(i, data.body)
         lay_plan(i, action, data)
         observe_for_controller(i, data)
         observe(i, data)

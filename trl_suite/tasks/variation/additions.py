@@ -109,7 +109,8 @@ class Additions(Component):
         self._inner, self._own = inner, inner.observation.shape[1]
         terms = inner.reward_terms.shape[1]
         size = sum(block.size for block in self.blocks)
-        self._outcome = outcome(n, self._own + size, terms + len(self._rewards))
+        own = outcome(n, self._own + size, terms + len(self._rewards))
+        self._outcome = own._replace(fell=inner.fell, diverged=inner.diverged)
         self._terms = self._outcome.reward_terms[:, terms:]
         self.action = task.action = np.zeros((n, len(task.action_map)))
         self.saved = (by_name('Saved', {'action': self.action}), self._outcome)
@@ -126,7 +127,6 @@ class Additions(Component):
         inner, out = self._inner, self._outcome
         if fresh:
             self.action[env_ids] = self._terms[env_ids] = 0.0
-        out.diverged[env_ids] = inner.diverged[env_ids]
         out.observation[env_ids, : self._own] = inner.observation[env_ids]
         out.reward_terms[env_ids, : inner.reward_terms.shape[1]] = inner.reward_terms[env_ids]
         usable, column = env_ids[~out.diverged[env_ids]], self._own
@@ -136,7 +136,6 @@ class Additions(Component):
             column += size
         out.reward[env_ids] = inner.reward[env_ids]
         out.failed[env_ids] = failed = inner.failed[env_ids]
-        out.fell[env_ids] = inner.fell[env_ids]
         if fresh:
             return
         for k, (name, (weight, function)) in enumerate(self._rewards.items()):
@@ -145,7 +144,7 @@ class Additions(Component):
             out.reward[env_ids] += self._terms[env_ids, k]
         for name, function in self._failures.items():
             failed = failed | (self._ask('failure', name, function, 1)[env_ids, 0] != 0)
-        out.failed[env_ids], out.fell[env_ids] = failed, failed & ~out.diverged[env_ids]
+        out.failed[env_ids] = failed
 
     def _ask(
         self, kind: str, name: str, function: Function, size: int, weight: float = 1.0
