@@ -90,7 +90,7 @@ class PagesTest(FolderTest):
             self.assertTrue(found or built(target), f'{path}: {link}')
 
     @parameterized.parameters(
-        'README', 'CONTRIBUTING', 'docs/quick_start', 'docs/concepts', 'docs/guide', 'docs/realism',
+        'README', 'CONTRIBUTING', 'docs/concepts', 'docs/guide', 'docs/realism',
         'docs/reports/robustness', 'docs/benchmark',
     )  # fmt: skip
     def test_code_runs(self, name):
