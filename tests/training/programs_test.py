@@ -720,8 +720,8 @@ class StoredPagesTest(parameterized.TestCase):
         )
 
     @parameterized.parameters(
-        ('actions', 'gait_actions', 'terrain_adaptive_gaits'), ('hierarchy', 'hierarchy', 'deeploco'),
-        ('limits', 'limits', 'robustness'),
+        ('actions', 'gait_actions', 'terrain_adaptive_gaits'), ('changes', 'gait_changes', 'terrain_adaptive_gaits'),
+        ('hierarchy', 'hierarchy', 'deeploco'), ('limits', 'limits', 'robustness'),
     )  # fmt: skip
     def test_comparisons(self, name, stored, page):
         found = files.read_json(results.DOCS / f'data/{stored}.json')
