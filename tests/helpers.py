@@ -11,7 +11,6 @@ from unittest import mock
 
 import numpy as np
 from absl.testing import parameterized
-from dm_control import composer
 
 from trl_suite import suite, terrain
 from trl_suite.engine import world
@@ -53,6 +52,8 @@ _kept = {}  # arguments -> environment, test that used it last, options (whose o
 
 def users_arena(timestep=0.002):
     """A level arena that is none of the suite; those of dm_control.locomotion need labmaze."""
+    from dm_control import composer  # after trl_suite, which imports Triton before it
+
     arena = composer.Arena(name='mine')
     arena.mjcf_model.option.timestep = timestep
     arena.mjcf_model.worldbody.add('geom', name='floor', type='plane', size=(0, 0, 1))

@@ -167,6 +167,17 @@ class ImportTest(parameterized.TestCase):
         out, err = python(code, **variables, DISPLAY='', WAYLAND_DISPLAY='')
         self.assertEqual((out, besides_notices(err)), (f'{expected}\n', ''))
 
+    def test_triton_is_left_alone_after_dm_control(self):
+        code = """
+            import pathlib, sys, tempfile
+            folder = tempfile.TemporaryDirectory()
+            pathlib.Path(folder.name, 'triton.py').write_text('print("imported")')
+            sys.path.insert(0, folder.name)
+            import dm_control.mujoco, trl_suite.suite
+        """
+        out, err = python(code, MUJOCO_GL='egl')
+        self.assertEqual((out, besides_notices(err)), ('', ''))
+
     def test_a_python_without_docstrings(self):
         code = f"""
             from trl_suite import suite

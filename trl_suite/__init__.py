@@ -42,9 +42,9 @@ if (
     # dm_control would choose GLFW, which cannot render without a display. This creates no context.
     os.environ['MUJOCO_GL'] = 'egl'
 
-if os.environ.get('MUJOCO_GL') == 'egl':
+if os.environ.get('MUJOCO_GL') == 'egl' and 'OpenGL' not in sys.modules:
     # PyTorch for CUDA imports Triton at its first optimizer. This ends the process if dm_control has
-    # loaded Mesa before, which has another LLVM; the other order works.
+    # loaded Mesa before, by OpenGL, which has another LLVM; the other order works.
     with contextlib.suppress(Exception):  # of a broken Triton PyTorch complains
         importlib.import_module('triton')
 
