@@ -171,9 +171,8 @@ def combine(
         clip = _own_motion(figure, kind)
     if terrain is None:
         terrain = 'plane' if figure.spatial else 'flat'
-    if isinstance(clip, str) and clip.lower().endswith(
-        '.npz'
-    ):  # read once: the working folder may change
+    # Read once: the working folder may change.
+    if isinstance(clip, str) and clip.lower().endswith('.npz'):
         clip = (motion.load_steps if kind is motion.FootstepLibrary else motion.load)(clip)
     if clip is not None and not isinstance(clip, str):
         own['clip'], clip = clip, clip.name

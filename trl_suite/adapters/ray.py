@@ -145,10 +145,8 @@ class RayExecutor:
 
     def cancel(self) -> None:
         """Kills the tasks that are not done; who waits for their results gets a RayError."""
-        for task in list(
-            self._tasks
-        ):  # libraries may catch the exception that is raised without force
-            ray.cancel(task, force=True)
+        for task in list(self._tasks):
+            ray.cancel(task, force=True)  # without, libraries may catch the exception
 
     def close(self) -> None:
         """Disconnects; ends a Ray that this object has started."""

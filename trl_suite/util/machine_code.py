@@ -5,7 +5,8 @@ no machine code and no files of their own.
 
 A file holds the code of one function for one signature: the SHA-256 of what follows, and a pickle. Its
 name is a hash of what the code depends on: its file, Numba and Python, apart from the sources of the
-package, on which the name of the folder depends. Other files of a user are not in it. What is missing, damaged, or may be written by others is compiled again.
+package, on which the name of the folder depends. Other files of a user are not in it. What is missing,
+damaged, or may be written by others is compiled again.
 
 Two processes that need the same code at the same time do not both compile it: one holds a lock, which
 the operating system releases when the process ends in any way, and the other waits. There are no
