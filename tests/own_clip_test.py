@@ -32,6 +32,32 @@ FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
 LEG = """<body name="{0}_thigh" pos="0 {1} -.1" euler="90 0 0"><joint name="{0}_hip" axis="{2}"/>
 <geom type="capsule" size=".04" fromto="0 0 0 0 -.4 0"/></body>"""
 
+# What stands before the leg in the trunk, joints before the hip, the thigh's place in the trunk, and the
+# anchors of hip and knee in thigh and shin.
+STANDS = {
+    'plain': ('', '', -0.1, (0, 0)),
+    'a link without a joint': ('<body name="head" pos="0 0 .2"><geom size=".1"/></body>', '', -0.1, (0, 0)),
+    'a body without a mass': ('<body name="mount" pos="0 0 .1">', '', -0.2, (0, 0)),
+    'three joints of a body': ('', '<joint name="a" axis="1 0 0"/><joint name="b" axis="0 0 1"/>', -0.1, (0, 0)),
+    'joints beside the origins': ('', '', -0.4, (0.3, 0.1)),
+}  # fmt: skip
+
+
+def stand(folder, before, hips, place, anchors):
+    """Returns a character of one leg from a file, see `STANDS`."""
+    path, (hip, knee) = folder / 'stand.xml', anchors
+    after = '</body>' if before and not before.endswith('</body>') else ''
+    path.write_text(
+        f'<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/><geom size=".1"/>{before}'
+        f'<body name="thigh" pos="0 0 {place}">{hips}'
+        f'<joint name="right_hip" axis="0 -1 0" pos="0 0 {hip}"/><geom size=".04" fromto="0 0 {hip} 0 0 {hip - 0.4}" '
+        f'type="capsule"/><body name="shin" pos="0 0 {hip - 0.4 - knee}"><joint name="right_knee" axis="0 -1 0" '
+        f'pos="0 0 {knee}"/><geom type="capsule" size=".04" fromto="0 0 {knee} 0 0 {knee - 0.4}"/></body></body>{after}'
+        '</body></worldbody></mujoco>'
+    )
+    with mock.patch.object(limited, 'call', in_this_process):
+        return characters.from_file(path)
+
 
 def in_file(rotation):
     """Converts a rotation to a file's frame."""
@@ -488,6 +514,30 @@ class RetargetTest(ClipTest):
         found = retarget()
         column, _ = found.layout.starts('left_hip')
         np.testing.assert_allclose(found.poses[:, column], 0.5 * sign * t, atol=1e-9)
+
+    def test_bodies_and_joints_of_a_file_need_not_correspond(self):
+        """All variants have hip and knee at the same places, about the same axis."""
+        t = np.linspace(0, 1, 11)
+        clip = free(
+            t, np.c_[t, 0 * t, 1 + 0 * t], Rotation.identity(11), right_hip=0.5 * t, right_knee=-t
+        )
+        joints = {name: name for name in ('root', 'right_hip', 'right_knee')}
+        bvh, expected = self.folder / 'a.bvh', None
+        for name, (before, hips, place, anchors) in STANDS.items():
+            with self.subTest(name):
+                character = stand(self.folder, before, hips, place, anchors)
+                found = [retargeting.retarget(clip, character, joints)]
+                if expected is None:
+                    write_bvh(Figure(character, found[0], 11), bvh)
+                    expected = found[0].displacement
+                capture = retargeting.read(bvh, character)
+                theirs = {each: bvh_name(each) for each in joints}
+                found.append(retargeting.retarget(capture, character, theirs))
+                for each in found:
+                    np.testing.assert_allclose(each.displacement, expected, atol=1e-5)
+                    for joint, angle in (('right_hip', 0.5 * t), ('right_knee', -t)):
+                        column, _ = each.layout.starts(joint)
+                        np.testing.assert_allclose(each.poses[:, column], angle, atol=1e-5)
 
     def test_a_jump_does_not_make_a_clip_small(self):
         t = np.linspace(0, 1, 31)

@@ -34,7 +34,7 @@ class KinematicViewer:
     Attributes:
       character: the entity.
       layout: the columns of its poses, as in a `Clip`.
-      links: name of the link of each collision geom, in the order of `corners`; links with several
+      links: name of the body of each collision geom, in the order of `corners`; bodies with several
         geoms are repeated.
       environment: a `composer.Environment` with a null task, for `rendering`.
     """
@@ -71,11 +71,11 @@ class KinematicViewer:
         model = physics.model
         geoms = [geom.full_identifier for geom in figure.collision_geoms]
         self._geoms = np.array([model.name2id(name, 'geom') for name in geoms])
-        bodies = [model.name2id(body.full_identifier, 'body') for body in figure.bodies]
-        self._bodies = np.array(bodies)
-        self.links = tuple(
-            figure.spec.links[bodies.index(body)] for body in model.geom_bodyid[self._geoms]
-        )
+        self._joints = np.atleast_1d(physics.bind(figure.joints).element_id)
+        root_body = model.name2id(figure.bodies[0].full_identifier, 'body')
+        self._bodies = np.array([root_body, *model.jnt_bodyid[self._joints]])
+        bodies = (model.id2name(body, 'body') for body in model.geom_bodyid[self._geoms])
+        self.links = tuple(name.rpartition('/')[2] for name in bodies)
         box = model.geom_aabb[self._geoms]
         self._local = box[:, None, :3] + _SIGNS * box[:, None, 3:]
         self.put(self.standing())
@@ -107,15 +107,20 @@ class KinematicViewer:
         return data.geom_xpos[self._geoms][:, None] + self._local @ frames.transpose(0, 2, 1)
 
     def places(self) -> np.ndarray:
-        """Returns the positions of the joints of all links, m, (links, 3), the root's first."""
-        return self._physics.data.xpos[self._bodies].copy()
+        """Returns the position of the root and of all joints, m, (1 + joints, 3)."""
+        data = self._physics.data
+        return np.concatenate([data.xpos[self._bodies[:1]], data.xanchor[self._joints]])
+
+    def bodies(self) -> list[int]:
+        """Returns a number of the root's body, and of that which each joint moves."""
+        return self._bodies.tolist()
 
     def orientations(self) -> np.ndarray:
-        """Returns the orientations of all links, unit quaternions wxyz, (links, 4)."""
+        """Returns the orientations of these bodies, unit quaternions wxyz, (1 + joints, 4)."""
         return self._physics.data.xquat[self._bodies].copy()
 
     def axes(self) -> list[np.ndarray | None]:
-        """Returns the axis of every hinge in the frame of its link, (3,); None for others."""
+        """Returns the axis of every hinge in the frame of its body, (3,); None for others."""
         joints = self._physics.bind(self.character.joints)
         hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
         return [
@@ -124,12 +129,19 @@ class KinematicViewer:
         ]
 
     def parents(self) -> list[int]:
-        """Returns the index of each link's parent in link order, -1 for the root."""
-        model, bodies = self._physics.model, self._bodies.tolist()
-        return [
-            bodies.index(parent) if (parent := model.body_parentid[body]) in bodies else -1
-            for body in bodies
-        ]
+        """Returns -1 for the root, and for each joint the number of the one before it, 0 for the root.
+
+        It is the last joint before it on the way from the root, which may move the same body.
+        """
+        above, last = self._physics.model.body_parentid, {self._bodies[0]: 0}
+        result = [-1]
+        for number, body in enumerate(self.bodies()[1:], 1):
+            near = body
+            while near not in last:
+                near = above[near]
+            result.append(last[near])
+            last[body] = number
+        return result
 
     def picture(self, **options: Any) -> np.ndarray:
         """Renders the pose, (h, w, 3) uint8; options are those of `trl_suite.rendering.frame`."""

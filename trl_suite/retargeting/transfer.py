@@ -202,13 +202,18 @@ def _yaw(path: np.ndarray, turns: np.ndarray) -> float:
 
 
 def _bones(figure: KinematicViewer, chosen: Mapping[str, str]) -> dict[int, int]:
-    """Returns link -> child for limbs: links with exactly one child that follows the motion."""
-    ours = ('root', *figure.layout.joints)
-    children: dict[int, list[int]] = {}
+    """Returns joint -> next joint for limbs: their bodies have exactly one child that follows the motion."""
+    ours, bodies = ('root', *figure.layout.joints), figure.bodies()
+    children: dict[int, dict[int, int]] = {}  # by body: the first joint of each child
     for i, parent in enumerate(figure.parents()):
-        if parent > 0 and ours[i] in chosen and ours[parent] in chosen:
-            children.setdefault(parent, []).append(i)
-    return {parent: found[0] for parent, found in children.items() if len(found) == 1}
+        if parent > 0 and ours[i] in chosen and bodies[i] != bodies[parent]:
+            children.setdefault(bodies[parent], {}).setdefault(bodies[i], i)
+    return {
+        i: child
+        for i, our in enumerate(ours)
+        if our in chosen and len(found := children.get(bodies[i], {})) == 1
+        for child in found.values()
+    }
 
 
 def _vectors(
@@ -247,7 +252,7 @@ def _limbs(figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]) 
 def _captured(
     figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str], upright: np.ndarray
 ) -> dict[int, np.ndarray]:
-    """Returns the target orientations of links, by index, (n, 4) in the world."""
+    """Returns the target orientations of the bodies of joints, by number, (n, 4) in the world."""
     ours = ('root', *figure.layout.joints)
     vectors, parents = _vectors(figure, motion, chosen), figure.parents()
     zero = figure.orientations()
