@@ -28,6 +28,7 @@ from trl_suite.characters import inspect, model_file
 from trl_suite.describe import tasks
 from trl_suite.motion import quaternion
 from trl_suite.registry import build
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk import task as walk
 from trl_suite.tasks.walk.task import Walk
@@ -147,6 +148,39 @@ class CharacterTest(WrittenTest):
         self.assertEqual((servo.kp, servo.kd), (90, 9))
         self.assertIn(
             'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', spec.notes
+        )
+
+    def test_a_body_without_mass_stays_without(self):
+        """By options of the compiler, or by its geoms."""
+        foot = '<body name="foot_{}" pos="0 0 -.1"><geom size=".05" {}/></body>'
+        feet = foot.format('a', 'group="3"') + foot.format('b', 'mass="0"')
+        text = MJCF.replace('<geom size=".15', f'{feet}<geom size=".15')
+        spec = self.planar(
+            text.replace('<worldbody>', '<compiler inertiagrouprange="0 2"/><worldbody>', 1)
+        )
+        model = compiled(spec)
+        np.testing.assert_array_equal([model.body(f'foot_{name}').mass[0] for name in 'ab'], 0)
+        self.assertNoCommonElements(('foot_a', 'foot_b'), spec.links)
+        geoms = KinematicViewer(spec).links
+        self.assertContainsSubset(('foot_a', 'foot_b', 'trunk'), geoms)
+        self.walk(spec)
+
+    def test_pairs_and_exclusions(self):
+        """Those with the world, or with what is beside the character, are left out."""
+        rules = (
+            '<contact><exclude body1="world" body2="trunk"/><exclude body1="trunk" body2="left_shin"/>'
+            '<pair geom1="right" geom2="left"/><pair geom1="floor" geom2="left"/></contact></mujoco>'
+        )
+        text = MJCF.replace('</mujoco>', rules)
+        for side in ('right', 'left'):
+            shin = f'name="{side}_knee" axis="0 -1 0" range="-120 0"/>\n<geom '
+            self.assertIn(shin, text)
+            text = text.replace(shin, f'{shin}name="{side}" ')
+        spec = self.planar(text)
+        model = compiled(spec)
+        self.assertEqual((model.nexclude, model.npair), (1, 1))
+        self.assertIn(
+            "the pair of 'floor' and 'left' is left out: one is beside the character", spec.notes
         )
 
     def test_unnamed_elements_get_names(self):
@@ -688,6 +722,21 @@ class TerrainTest(WrittenTest):
             terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0
         )
         np.testing.assert_allclose(line.height([0.4, 0.3, 0.2]), [2, 0.5, -1])
+        # White and black of a printer's colours: no ink, and one of the four.
+        inks = np.zeros((5, 7, 4), np.uint8)
+        inks[:, 4:, 3] = 255
+        Image.fromarray(inks, 'CMYK').save(self.folder / 'ink.tif')
+        ground = terrain.SpatialGround(terrain.from_image(self.folder / 'ink.tif', 0.2, -1, 2), 0)
+        np.testing.assert_allclose(ground.height([0.0, 0.4], [0.0, 0.0]), [2, -1], atol=0.02)
+
+    @parameterized.parameters(3.8, 4.0)
+    def test_the_rim_of_a_mesh_belongs_to_it(self, side):
+        """Whether or not single precision, as in .stl, has the number."""
+        box = trimesh.creation.box((2 * side, 2 * side, 1))
+        box.export(self.folder / 'box.stl')
+        ground = terrain.SpatialGround(terrain.from_mesh(self.folder / 'box.stl', 0.2), 0)
+        x = np.array([0, side - 0.3, side, side + 3, 0])
+        np.testing.assert_allclose(ground.height(x, x[::-1]), 0.5, atol=1e-6)
 
     def test_starts_are_spread_by_the_seed(self):
         for draw, function, place in (
@@ -743,6 +792,8 @@ class TerrainTest(WrittenTest):
             (lambda: terrain.from_function(lambda x: 2 * x, 'wedge'), 'exists; pass'),
             (lambda: terrain.from_function(lambda x, y: 0 * x, 'wedge'), 'exists and is planar; choose another name'),
             (lambda: terrain.from_function(np.abs, 'hills3d', replace=True), 'exists and is three-dimensional'),
+            (lambda: terrain.register('plane')(print), "'plane' exists and is three-dimensional; choose another"),
+            (lambda: terrain.register3d('var2d_gaps', replace=True)(print), "'var2d_gaps' exists and is planar"),
             (lambda: terrain.from_heights(['0', '1'], 1), 'heights: expected an array of numbers: the type is <U1'),
             (lambda: terrain.from_image(f / 'signed.tif', 1), 'signed.tif: .*mode I, .*expected 8 or 16 bits'),
             (lambda: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),

@@ -257,9 +257,18 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
     excluded = [
         item
         for item in tree.contact.all_children()
-        if item.tag == 'pair' or not {item.body1.name, item.body2.name} <= {*found.bodies}
+        if item.tag == 'exclude'
+        and not {getattr(body, 'name', body) for body in (item.body1, item.body2)}
+        <= {*found.bodies}
     ]
     ties = _ties(tree, root, joints)
+    own = {geom.name for geom in root.find_all('geom')}
+    for item in tree.contact.pair:
+        if not {item.geom1.name, item.geom2.name} <= own:
+            excluded.append(item)
+            found.notes.append(
+                f'the pair of {item.geom1.name!r} and {item.geom2.name!r} is left out: one is beside the character'
+            )
     found.notes += [
         f'{item.tag} {item.name!r} is left out: it ties the character to something else'
         for item in ties
@@ -292,13 +301,13 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         tree.default.dclass = 'own'  # MJCF without this name could not be read back
     root.pos, root.quat = (0, 0, 0), None
     for i, name in zip(found.ids, found.bodies, strict=True):
-        if model.body_mass[i] > 0:  # as compiled with the file's options
-            body = tree.find('body', name)
-            if body.inertial is not None:
-                body.inertial.remove()
-            place = {'pos': model.body_ipos[i], 'quat': model.body_iquat[i]}
-            mass, inertia = model.body_mass[i], model.body_inertia[i]
-            body.add('inertial', mass=mass, diaginertia=inertia, **place)
+        # As compiled with the file's options, by which a body with geoms may have no mass.
+        body = tree.find('body', name)
+        if body.inertial is not None:
+            body.inertial.remove()
+        place = {'pos': model.body_ipos[i], 'quat': model.body_iquat[i]}
+        mass, inertia = model.body_mass[i], model.body_inertia[i]
+        body.add('inertial', mass=mass, diaginertia=inertia, **place)
     for i in found.joints:
         name = model.joint(i).name
         joint = tree.find('joint', name)
