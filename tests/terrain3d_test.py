@@ -272,7 +272,9 @@ class ObstaclesTest(parameterized.TestCase):
             for part in parts:
                 self.assertContainsSubset({tuple(p) for p in part.position}, known)
         i, j = vertices(30, 50), vertices(-45, -30)
-        for source in ('steps3d', 'trail3d2'):
+        wide = {'Type': 'trail3d', 'Params': [{'PathWidth0': 30, 'PathWidth1': 30}]}
+        narrow = {'ObstacleDensity': 0.5, 'ObstacleWidth0': 0.1, 'ObstacleWidth1': 0.1}
+        for source in ('steps3d', 'trail3d2', wide, {'Type': 'obstacles3d', 'Params': [narrow]}):
             one, other = (make(source, 4).layout.grid for _ in range(2))
             other(vertices(60, 80), j)
             np.testing.assert_array_equal(one(i, j)[20:50, 30:], other(i[20:50], j[30:]))

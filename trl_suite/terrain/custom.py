@@ -28,8 +28,6 @@ import numpy.typing as npt
 
 from trl_suite.terrain import mesh
 from trl_suite.terrain.generators import (
-    GENERATORS,
-    GENERATORS3D,
     START_SPAN,
     Parameters,
     register3d,
@@ -47,6 +45,8 @@ FARTHEST = 1e6  # m; of a vertex of a mesh
 _FORMATS = {'PNG': '.png', 'TIFF': '.tif .tiff', 'BMP': '.bmp', 'JPEG': '.jpg .jpeg'}  # of Pillow
 IMAGES = {suffix: kind for kind, suffixes in _FORMATS.items() for suffix in suffixes.split()}
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
+
+RIM = 1e-6  # cells by which points may lie beside a mesh, whose numbers are often rounded
 
 HeightFunction = Callable[..., npt.ArrayLike]
 
@@ -140,12 +140,6 @@ def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
 
 
 def _register(name: str, function: Any, arguments: int, replace: bool = True) -> None:
-    if name in (GENERATORS3D if arguments == 1 else GENERATORS):
-        kinds = 'planar', 'three-dimensional'
-        raise ValueError(
-            f'terrain type {name!r} exists and is {kinds[arguments == 1]}; choose another name for one that '
-            f'is {kinds[arguments - 1]}'
-        )
     if arguments == 1:
         register_line(name, function, replace=replace)
         return
@@ -316,6 +310,8 @@ def _pixels(file: pathlib.Path) -> np.ndarray:
                     f'pixels have mode {picture.mode}, signed, wide or real numbers; expected 8 or 16 bits '
                     'without sign. For elevations in m, read them with another library and use from_heights'
                 )
+            if picture.mode in ('CMYK', 'YCbCr', 'LAB', 'HSV'):
+                return np.asarray(picture.convert('RGB'))
             return np.asarray(picture.convert('I;16') if widened else picture)
     except Exception as error:  # of the reader's own kinds
         raise ValueError(f'{file}: cannot be read as {kind} ({error})') from None
@@ -333,7 +329,8 @@ def from_mesh(
 ) -> Terrain:
     """Makes terrain from a mesh: the height at a point is that of the highest triangle there.
 
-    Points outside the mesh have the height of its lowest point.
+    Holes, and gaps between its outline and the rectangle around it, have the height of its lowest point.
+    Beyond this rectangle the heights at its rim go on.
 
     Args:
       path: .obj, .glb, .gltf, .stl or .ply.
@@ -373,15 +370,16 @@ def from_mesh(
             f'{file}: the mesh lies over x from {low[0]:g} to {high[0]:g} m and y from {low[1]:g} to '
             f'{high[1]:g} m, not over the origin, where characters start; pass centre=True, or move it'
         )
-    first = np.ceil(low[:2] / spacing - 1e-6).astype(int)
-    last = np.floor(high[:2] / spacing + 1e-6).astype(int)
+    first = np.ceil(low[:2] / spacing - RIM).astype(int)
+    last = np.floor(high[:2] / spacing + RIM).astype(int)
     count = last - first + 1
     if min(count) < 2 or math.prod(count.tolist()) > LARGEST:
         raise ValueError(
             f'{file}: {count[0]} x {count[1]} points lie over the mesh, spacing is {spacing:g} m; '
             f'expected 2 or more along each axis and no more than {LARGEST:g} in all'
         )
-    x, y = (spacing * (first[i] + np.arange(count[i])) for i in (0, 1))
+    points = (spacing * (first[i] + np.arange(count[i])) for i in (0, 1))
+    x, y = (np.clip(at, low[i], high[i]) for i, at in enumerate(points))
     with errors.naming(file):
         heights = mesh.heights_over(triangles, x, y)
     heights[np.isinf(heights)] = low[2]

@@ -201,7 +201,15 @@ def _adding(
     defaults = check(f'terrain type {type_name!r}', defaults, full)
     full = {name: each._replace(default=defaults[name]) for name, each in full.items()}
 
+    kind, other, others = 'planar', 'three-dimensional', _spatial
+    if generators is _spatial:
+        kind, other, others = other, kind, _planar
+
     def add(function: Any) -> Any:
+        if type_name in others:
+            raise ValueError(
+                f'terrain type {type_name!r} exists and is {other}; choose another name for one that is {kind}'
+            )
         known = generators.get(type_name)
         if known is not None and not replace and not _same(known.function, function):
             raise ValueError(

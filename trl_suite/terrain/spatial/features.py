@@ -344,9 +344,9 @@ def _rubble(drawn: _Obstacles) -> GridFunction:
     def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:
         corner = np.array([i[0], j[0]])
         low, high = GRID * corner, GRID * np.array([i[-1], j[-1]])
-        begin, end, height = drawn.touching(low, high)
+        # Vertices in the closed rectangles; at least one vertex along each axis, which may lie beyond.
+        begin, end, height = drawn.touching(low - GRID, high)
         heights = np.zeros((len(i), len(j)), np.float32)
-        # Vertices in the closed rectangles; at least one vertex along each axis.
         first = np.ceil(begin / GRID).astype(int)
         last = np.maximum(np.floor(end / GRID).astype(int), first)
         first, last = np.maximum(first - corner, 0), np.maximum(last - corner + 1, 0)

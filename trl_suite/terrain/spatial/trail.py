@@ -85,7 +85,7 @@ class Trail:
           heights: (k, m), changed in place.
           i, j: indices of the vertices along x and y, consecutive, (k,) and (m,).
         """
-        self.reach(i[-1] * GRID)
+        self.reach(i[-1] * GRID + 0.5 * self._widest)
         half = 0.5 * self.width[:, None]
         corner, size = np.array([i[0], j[0]]), (len(i), len(j))
         low = np.floor((np.minimum(self.start, self.end) - half) / GRID).astype(int) - corner
