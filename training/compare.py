@@ -83,12 +83,18 @@ ACTIONS = {
     'both': 'base action with changes (MACE)', 'ppo': 'default gait with changes, PPO',
 }  # fmt: skip
 
+# A step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation.
+CYCLES: dict[str, Any] = {
+    'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9, 'initial_std': 0.1,
+    'evaluation_episodes': 32,
+}  # fmt: skip
+
 
 def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -> dict[str, Any]:
     """Trains with random first actions instead of those of a shipped policy."""
     common: dict[str, Any] = {'samples': cycles, 'evaluate_every': cycles / 4}
     if action == 'ppo':
-        curve = ppo.train(DOG, seed, settings.settings_for(DOG, **common), folder, 1)
+        curve = ppo.train(DOG, seed, settings.settings_for(DOG, **CYCLES, **common), folder, 1)
     else:
         own = learn_gaits.Settings(action=action, expert_cycles=0, evaluation_episodes=0, **common)
         curve = learn_gaits.train(DOG, seed, own, folder, 1)

@@ -519,10 +519,6 @@ DRIBBLING = {
         'evaluate_every': 8e4,
     },),
 }  # fmt: skip
-CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation
-    'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
-    'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
-}  # fmt: skip
 # A policy trained on walls of 0.25 m falls at three of four walls of up to 0.4 m.
 LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 HIGHER = rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))
@@ -669,8 +665,7 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
     ('PD_Biped3D_HLC_PathFollowing-v0', ON_A_TRAIL),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
-    ('FSM_*', CYCLES),
-    ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
+    ('FSM_*', {'samples': 1e6, 'least_share': {}, 'evaluation_episodes': 16}),  # a step is a cycle
 )  # fmt: skip
 
 # Policies for worlds and sensors that vary, in `trained/randomized`: `train_randomized.py` continues
