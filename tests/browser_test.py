@@ -334,6 +334,10 @@ class BrowserTest(parameterized.TestCase):
         self.assertEqual(found, found[:1] * 3)
         with self.assertRaisesRegex(ValueError, r'seed is -1; expected a seed in \[0, 2\*\*32\)'):
             browser.Browser(DOG, seed=-1, port=0)
+        with self.assertRaisesRegex(
+            ValueError, "task_kwargs has 'random'; use the argument `seed`"
+        ):
+            browser.Browser(DOG, port=0, task_kwargs={'random': 5})
 
     def test_start_and_stop(self):
         viewer = browser.Browser(DOG, 'zero', port=0)

@@ -665,6 +665,7 @@ class ConstructionTest(parameterized.TestCase):
             environment.observation_spec, lambda: environment.info, lambda: environment.physics,
             lambda: environment.add_extra_hook('before_step', print), lambda: environment.task,
             lambda: rendering.frame(environment), lambda: pickle.dumps(environment), environment.action_spec,
+            environment.reward_spec, environment.discount_spec,
         )  # fmt: skip
         cases = ((call, 'the environment is closed') for call in calls)
         assert_refused(self, *cases, error=RuntimeError)

@@ -27,6 +27,7 @@ from trl_suite import policies, rendering, suite
 from trl_suite.controllers import footstep_controller
 from trl_suite.policies import files as policy_files
 from trl_suite.tasks.navigation import hierarchical, scripted
+from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'
@@ -482,6 +483,14 @@ class FrameTest(parameterized.TestCase):
                 np.testing.assert_array_equal(found.observation[name], value)
             np.testing.assert_array_equal(frame.task.plan.landing, plan.task.plan.landing)
 
+    @parameterized.parameters(
+        {'sensors': 'harsh'}, {'rewards': {'x': (1.0, lambda task: 0 * task.world.qpos[:, 0])}}
+    )
+    def test_a_plan_that_is_laid_is_observed(self, **components):
+        environment, _ = started(PLANE, interface='frame', **components)
+        low = environment.task.lay(np.append([0.1, 0.1, 0.2, 0, 0], np.zeros(17))[None])
+        np.testing.assert_array_equal(environment.observation()['low_level'], low[0])
+
     def test_a_plan_takes_effect_at_the_start_of_a_footstep(self):
         environment, _ = started(PLANE, interface='frame')
         task, rng, plans = environment.task, np.random.default_rng(0), []
@@ -596,6 +605,12 @@ class ScriptedTest(parameterized.TestCase):
         self.assertLessEqual(fell.sum(), 1)
         self.assertGreaterEqual(step.info['goals_reached'][~fell].mean(), 3)
         self.assertGreater(np.mean(rewards), 0.8)  # standing still earns 0.38
+
+    def test_a_scripted_bearing_does_not_depend_on_other_simulations(self):
+        rng, bearing = np.random.default_rng(0), np.array([1.55, 0.3])
+        parts = {'terrain': np.stack([np.zeros(SAMPLES**2), rng.random(SAMPLES**2)])}
+        found, _ = scripted.free_bearing(parts, bearing, np.full(2, 8.0))
+        self.assertEqual(found[0], 1.55)
 
     @parameterized.parameters(*IDS)
     def test_goals_of_all_grounds(self, id_):

@@ -281,7 +281,12 @@ class ConstructionTest(parameterized.TestCase):
 
 
 class FileTest(FolderTest):
-    @parameterized.parameters(planar, free, circle)
+    @parameterized.parameters(
+        planar,
+        free,
+        circle,
+        lambda: motion.Clip('c', [0, 1], [[0, 1, 0], [1, 1, 0]], 'planar', (), ()),
+    )
     def test_round_trip(self, make):
         path = self.folder / 'clip.npz'
         (self.folder / 'other').mkdir()

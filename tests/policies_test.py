@@ -496,6 +496,12 @@ class FileTest(FolderTest):
             policies.save(make(), self.folder / 'p.pkl')
         with self.assertRaisesRegex(FileNotFoundError, 'does not exist'):
             policies.save(make(), self.folder / 'none' / 'p.npz')
+        with (
+            mock.patch.object(files, 'LARGEST', 100),
+            self.assertRaisesRegex(ValueError, 'expected no more'),
+        ):
+            policies.save(make(), self.folder / 'q.npz')
+        self.assert_only('p.npz')
 
     def test_truncated_or_damaged_or_no_archive(self):
         path = self.folder / 'p.npz'

@@ -21,7 +21,9 @@ from dm_control import mujoco as dm_mujoco
 from helpers import FolderTest, besides_notices
 
 from trl_suite import rendering, suite
+from trl_suite import terrain as terrains
 from trl_suite.rendering import cameras, drawing, overlays
+from trl_suite.terrain import generators
 from trl_suite.util import program
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -388,6 +390,21 @@ class SpatialTest(FolderTest):
         for preset in ('plane', 'conveyor3d'):  # level ground
             rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
         self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
+
+    def test_a_map_shows_no_height_where_there_is_no_ground(self):
+        self.enterContext(mock.patch.dict(generators._spatial))
+        block = terrains.boxes([(0, 0)], (2, 2), top=0.5)
+        terrains.register3d('island3d')(
+            lambda parameters, rng: terrains.Layout(level=None, boxes=block)
+        )
+        with (
+            mock.patch('matplotlib.axes.Axes.imshow', side_effect=ValueError('drawn')) as drawn,
+            self.assertRaisesRegex(ValueError, 'drawn'),
+        ):
+            rendering.plot_terrain({'Type': 'island3d'}, self.folder / 'a.png', draws=1, length=8)
+        heights = drawn.call_args.args[0]
+        self.assertEqual(set(heights[np.isfinite(heights)]), {0.5})
+        self.assertBetween(np.isnan(heights).mean(), 0.6, 0.8)
 
 
 @functools.cache

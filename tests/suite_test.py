@@ -73,6 +73,8 @@ DO_NOT_FIT = (  # arguments of `suite.build`
     ({'character': 'biped3d_simbicon'}, "'biped3d_simbicon' has no clip of its own"),
     ({'character': 'biped3d', 'task': 'direct_navigation', 'task_kwargs': {'reward': 'original'}},
      "unknown character with reward='original', which needs its steps 'biped3d'; did you mean 'biped3d_mocap'"),
+    ({'character': 'biped3d_mocap', 'task': 'direct_navigation', 'clip': motion.load('biped3d_mocap_run'),
+      'task_kwargs': {'reward': 'original'}}, "clip 'biped3d_mocap_run': reward='original' takes the steps"),
     ({'character': 'biped3d_mocap', 'clip': motion.load_steps('biped3d_mocap')},
      "'biped3d_mocap' is a library of steps; to be imitated"),
     ({'character': 'biped3d', 'task': 'footsteps', 'clip': motion.load('biped3d_walk')},

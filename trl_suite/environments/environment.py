@@ -251,6 +251,14 @@ class Environment(composer.Environment):
             return {FLAT_OBSERVATION_KEY: np.concatenate(parts)}
         return found
 
+    def reward_spec(self) -> specs.Array:
+        self.core.usable()
+        return super().reward_spec()
+
+    def discount_spec(self) -> specs.BoundedArray:
+        self.core.usable()
+        return super().discount_spec()
+
     def action_spec(self) -> specs.BoundedArray:
         return self.task.action_spec(self._physics_proxy)
 

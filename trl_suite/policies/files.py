@@ -29,7 +29,7 @@ from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Policy
 from trl_suite.util import archive, errors, resources
 from trl_suite.util.archive import take
-from trl_suite.util.files import existing
+from trl_suite.util.files import check_size, existing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
@@ -54,7 +54,7 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     """Writes a policy as .npz; an existing file is replaced when the new one is complete.
 
     Raises:
-      ValueError: another suffix.
+      ValueError: another suffix, or more numbers than `load` reads.
       OSError: the file cannot be written.
     """
     fields = {name: getattr(policy, name, None) for name in _FIELDS}
@@ -80,6 +80,8 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
     fields |= {name: value for name, value in optional.items() if value is not None}
     small = {name: _small(value) for name, value in fields.items()}
+    size = sum(np.asarray(value).nbytes for value in small.values())
+    check_size(pathlib.Path(path), LARGEST, size)
     archive.write(path, small)
 
 

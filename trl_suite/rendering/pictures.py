@@ -157,8 +157,11 @@ def _plot_maps(
         ground = terrains.SpatialGround(terrain, sequence, terrain_level=terrain_level)
         starts.append(ground.spawn(np.random.default_rng(sequence)))
         # Line by line, as each line intersects few of the boxes.
-        maps.append(np.stack([ground.height(places, y) for y in places]))
-    low, high = float(np.min(maps)), float(np.max(maps))
+        heights = np.stack([ground.height(places, y) for y in places])
+        maps.append(
+            np.where(np.isfinite(heights), heights, np.nan)
+        )  # nothing where there is no ground
+    low, high = float(np.nanmin(maps)), float(np.nanmax(maps))
     if low == high:
         low, high = low - 0.5, high + 0.5
     half = 0.5 * length

@@ -84,6 +84,10 @@ def _direct(parts: Parts, config: Any) -> Task:
             "character with reward='original', which needs its steps", motion.steps_names(), name
         )
         steps = motion.load_steps(name)
+        if parts.motion.name != parts.character.spec.clip:
+            raise ValueError(
+                f"clip {parts.motion.name!r}: reward='original' takes the steps of {name!r}, and no clip"
+            )
         return direct.hidden_plan(parts.character, parts.arena, steps, config, parts.actuation)
     return tracking(direct.DirectNavigation)(parts, config)
 

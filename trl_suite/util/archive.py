@@ -71,11 +71,11 @@ def arrays(path: pathlib.Path, what: str, largest: int = LARGEST) -> dict[str, n
 
 
 def take(found: dict[str, np.ndarray], name: str, kinds: str, axes: int) -> np.ndarray:
-    """Takes out an array whose dtype has one of the kinds, and which has so many axes."""
+    """Takes out an array whose dtype has one of the kinds, unless it is empty, and which has so many axes."""
     if name not in found:
         raise ValueError(f'field {name!r}: is missing')
     array = found.pop(name)
-    if array.dtype.kind not in kinds or array.ndim != axes:
+    if (array.size and array.dtype.kind not in kinds) or array.ndim != axes:
         raise ValueError(f'field {name!r}: has type {array.dtype} and {array.ndim} axes')
     return array
 

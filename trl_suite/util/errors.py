@@ -119,8 +119,8 @@ def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
     for key, each in found.items():
         if isinstance(each, Mapping):
             found[key] = options(key, each)
-        elif isinstance(each, list):
-            found[key] = [*map(_absolute, each)]
+        elif type(each) in (list, tuple):
+            found[key] = type(each)(map(_absolute, each))
         else:
             found[key] = _absolute(each)
     return found

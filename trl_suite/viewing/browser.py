@@ -109,6 +109,8 @@ class Browser:
           OSError: this machine cannot listen on the address.
         """
         check_seed('seed', seed)
+        if 'random' in (task_kwargs or {}):
+            raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
         web_server.load_viser()
         self.playing, self.speed, self.seed = True, 1.0, seed
         self._task_kwargs = {**(task_kwargs or {}), 'random': seed}

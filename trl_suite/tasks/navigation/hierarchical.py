@@ -325,6 +325,9 @@ class HierarchicalNavigation(GoalTask):
         rules.show_plans(
             self.world.all_ids, self.action_map.checked(action, self.world.n), self._pack
         )
+        if self.interface == 'frame' and self.seen is not self.outcome:  # components have a copy
+            part = self.blocks['low_level']
+            self.seen.observation[:, part] = self.outcome.observation[:, part]
         return self._controller_observation.copy()
 
     def finish_step(self, env_ids: np.ndarray) -> None:

@@ -107,8 +107,7 @@ def free_bearing(
     if 'surface' in parts:
         moving = np.abs(parts['surface'].reshape(n, 2, SAMPLES, SAMPLES)).max(1)
         blocked |= moving > MOVING
-    if not blocked.any():
-        return bearing, np.full(n, np.inf)
+    free = ~blocked.any((1, 2))
     bearings = np.clip(CANDIDATES[None] + np.clip(bearing, -1.4, 1.4)[:, None], -np.pi, np.pi)
     along, cost, room = LOOK, np.zeros(bearings.shape), np.full(bearings.shape, np.inf)
     for aside in (-CLEARANCE, 0.0, CLEARANCE):
@@ -124,7 +123,7 @@ def free_bearing(
         room = np.minimum(room, first)
     cost += 0.15 * np.abs(bearings - bearing[:, None])
     best = np.arange(n), cost.argmin(1)
-    return bearings[best], room[best]
+    return np.where(free, bearing, bearings[best]), room[best]
 
 
 def lengths(bearing: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarray:
