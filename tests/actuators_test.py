@@ -395,6 +395,20 @@ class NoiseTest(parameterized.TestCase):
         environment.step(np.zeros(len(environment.action_map)))
         self.assertGreater(np.count_nonzero(environment.physics.data.ptr.qfrc_applied), 5)
 
+    def test_joints_that_no_muscle_drives_have_none(self):
+        environment = suite.build(
+            'biped2d_full', 'muscle', task_kwargs={'random': 1, 'actuators': {'noise': 0.1}}
+        )
+        environment.reset()
+        environment.step(np.zeros(len(environment.action_map)))
+        joints = environment.task.character.joints
+        applied = environment.physics.bind(joints).qfrc_applied
+        driven = {joint.name for joint, torque in zip(joints, applied, strict=True) if torque}
+        legs = {
+            f'{side}_{joint}' for side in ('right', 'left') for joint in ('hip', 'knee', 'ankle')
+        }
+        self.assertEqual(driven, legs)
+
 
 class DelayTest(parameterized.TestCase):
     @parameterized.parameters(3.0, 37.0, 500.0)

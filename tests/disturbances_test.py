@@ -84,7 +84,11 @@ class WorldTest(parameterized.TestCase):
             <joint type="slide" axis="0 0 1"/><geom type="box" size="0.2 0.2 0.05" mass="3"/>
             </body></worldbody></mujoco>""")
         varied = variation.Variation(
-            world, ('friction', 'slope'), world.body_ids(['box']), np.zeros(0, int)
+            world,
+            ('friction', 'slope'),
+            world.body_ids(['box']),
+            np.zeros(0, int),
+            np.zeros(0, int),
         )
         varied.properties.friction[0], varied.properties.slope[0] = friction, slope
         varied.apply(0)

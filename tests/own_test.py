@@ -22,7 +22,7 @@ from helpers import FolderTest, assert_refused, assert_rows_are_singles, in_this
 from helpers import ground as heights_at
 from PIL import Image
 
-from trl_suite import characters, cli, engine, motion, policies, suite, terrain
+from trl_suite import characters, cli, describe, engine, motion, policies, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import inspect, model_file
 from trl_suite.describe import tasks
@@ -164,6 +164,62 @@ class CharacterTest(WrittenTest):
         geoms = KinematicViewer(spec).links
         self.assertContainsSubset(('foot_a', 'foot_b', 'trunk'), geoms)
         self.walk(spec)
+
+    @parameterized.parameters({'flex': 0.05}, {'flex': 0.05, 'backlash': 0.02})
+    def test_fixed_bodies_do_not_collide_across_a_joint_with_play(self, **actuators):
+        """What is fixed to the links on both sides of a joint overlaps there, as without a motor."""
+        mount = '<body name="mount"><geom size=".1"/></body>'
+        knob = '<body name="knob"><geom size=".1"/></body>'
+        leg = LEG.format('right', -0.1).replace('<geom type', f'{knob}<geom type', 1)
+        text = MJCF.replace(LEG.format('right', -0.1), mount + leg)
+        self.assertNotEqual(text, MJCF)
+        for each in ({}, actuators):
+            environment = suite.build(
+                self.planar(text),
+                task='walk',
+                terrain='flat',
+                task_kwargs={'random': 1, 'actuators': each},
+            )
+            environment.reset()
+            physics = environment.physics
+            bodies = physics.model.geom_bodyid[physics.data.contact.geom]
+            apart = [pair for pair in bodies.tolist() if 0 not in pair]
+            self.assertEmpty([pair for pair in apart if min(physics.model.body_weldid[pair]) > 0])
+
+    def test_friction_and_pairs_follow_the_world(self):
+        """Also of geoms whose friction has priority."""
+        rules = '<contact><pair geom1="right" geom2="left"/></contact></mujoco>'
+        text = MJCF.replace('</mujoco>', rules)
+        for side in ('right', 'left'):
+            shin = f'name="{side}_knee" axis="0 -1 0" range="-120 0"/>\n<geom '
+            text = text.replace(shin, f'{shin}name="{side}" priority="1" friction="1.5" ')
+        world = {'friction': 0.3, 'contact_depth': 0.01, 'contact_time': 0.05}
+        environment = suite.build(
+            self.planar(text),
+            task='walk',
+            terrain='flat',
+            task_kwargs={'random': 1, 'randomize': world},
+        )
+        environment.reset()
+        model, found = environment.physics.model, []
+        np.testing.assert_array_equal(model.pair_friction[:, :2], 0.3)
+        np.testing.assert_array_equal(
+            (model.pair_solimp[0, 2], model.pair_solref[0, 0]), (0.01, 0.05)
+        )
+        for _ in range(60):
+            environment.step(np.zeros(len(environment.action_map)))
+            found += environment.physics.data.contact.friction[:, 0].tolist()
+        self.assertEqual(set(found), {0.3})
+
+    def test_a_table_of_joints_needs_no_joint_for_each_body(self):
+        head = '<body name="head" pos="0 0 .4"><geom size=".1" mass="3"/></body>'
+        spec = self.planar(MJCF.replace('<geom size=".15', f'{head}<geom size=".15'))
+        row = suite.combine(spec, terrain='flat', task='walk')
+        told = '\n'.join(
+            map(str, dict(describe.sections(row, suite.build_environment(row, {}, {}))).values())
+        )
+        for name in ('right_hip', 'left_knee'):
+            self.assertIn(name, told)
 
     def test_pairs_and_exclusions(self):
         """Those with the world, or with what is beside the character, are left out."""

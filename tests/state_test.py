@@ -3,10 +3,13 @@
 import collections
 import dataclasses
 import hashlib
+import json
 import os
+import pathlib
 import pickle
 import subprocess
 import sys
+import tempfile
 from unittest import mock
 
 import helpers
@@ -402,6 +405,23 @@ class SignatureTest(parameterized.TestCase):
                     target.set_state(state)
                 self.assertEqual(pickle.dumps(target.get_state()), before)
                 self.build(**one).set_state(state)
+
+    def test_a_file_of_torques_counts_by_its_contents(self):
+        folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        for name, torque in (('a', 0.5), ('b', 0.6), ('c', 0.5)):
+            knee = {'angle': [-1, 0], 'positive': [1, 1], 'negative': [1, torque]}
+            (folder / f'{name}.json').write_text(json.dumps({'right_knee': knee}))
+
+        def made(name):
+            environment = self.build(actuators={'torque_pose': str(folder / f'{name}.json')})
+            environment.reset()
+            return environment
+
+        state = made('a').get_state()
+        made('c').set_state(state)
+        (folder / 'b.json').replace(folder / 'a.json')
+        with self.assertRaisesRegex(ValueError, 'another environment: actuators'):
+            made('a').set_state(state)
 
     def test_states_of_a_task_that_saves_other_arrays(self):
         environment = self.build()

@@ -152,10 +152,15 @@ class Units:
                 self.actuators.append(np.array([found[each] for each in names]))
             joints = [int(model.actuator_trnid[each[0], 0]) for each in self.actuators]
         self.joints = np.array(joints)
-        sizes = np.where(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_BALL, 3, 1)
-        starts = zip(model.jnt_dofadr[self.joints].tolist(), sizes.tolist(), strict=True)
+        driven = np.ones(len(joints), bool)
+        if self.muscles:
+            driven = np.isin(
+                self.joints, model.wrap_objid[model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT]
+            )
+        sizes = np.where(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_BALL, 3, 1)[driven]
+        starts = zip(model.jnt_dofadr[self.joints[driven]].tolist(), sizes.tolist(), strict=True)
         self.dofs = np.array([dof for start, n in starts for dof in range(start, start + n)], int)
-        self.dof_limits = np.repeat(self.limits, sizes)
+        self.dof_limits = np.repeat(self.limits[driven], sizes)
 
 
 def body(actuators: Actuators, spec: CharacterSpec) -> CharacterSpec:

@@ -14,9 +14,11 @@ of the joint without any torque inside. Both begin an episode at 0.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from xml.etree import ElementTree
 
 import numpy as np
+from dm_control import mjcf
 
 from trl_suite.characters.character import Character, CharacterSpec
 from trl_suite.util import files, resources
@@ -57,14 +59,25 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
             )
         if joints:
             _divide(body, joints[0], limits[names[0]], backlash, flex, damping)
-    # A link does not collide with the link to which its motor is attached, as without a motor.
+    # Links on both sides of a joint, and what is fixed to them, do not collide, as without a motor.
     for joint in character.joints:
         link, above = joint.parent, joint.parent.parent
         if above.tag == 'body':
-            ElementTree.SubElement(contact, 'exclude', body1=above.name, body2=link.name)
+            for one, other in itertools.product(_fixed(above), _fixed(link)):
+                ElementTree.SubElement(contact, 'exclude', body1=one.name, body2=other.name)
     changed = dataclasses.replace(spec, xml=ElementTree.tostring(tree, encoding='unicode'))
     vars(changed)['digest'] = spec.digest  # it is the same character for policies
     return changed
+
+
+def _fixed(body: mjcf.Element) -> list[mjcf.Element]:
+    """Returns the bodies that move with a body, itself included."""
+    while not body.joint and body.parent.tag == 'body':
+        body = body.parent
+    found = [body]
+    for each in found:  # also those that are added
+        found += [child for child in each.body if not child.joint]
+    return found
 
 
 def _divide(

@@ -51,7 +51,9 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
 
     `last` is the title of the last column, and its entry for each joint.
     """
-    masses, spec = floats(physics.bind(figure.bodies).mass), figure.spec
+    spec = figure.spec
+    moved = [figure.bodies[0], *(joint.parent for joint in figure.joints)]
+    masses = [float(physics.bind(body).mass) for body in moved]
     own = spec.root_weight if last[0] == REWARD_WEIGHT else ''
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', own)]
     ranges, limits = figure.joint_ranges, figure.torque_limits

@@ -52,6 +52,7 @@ class Variation:
         varied: Collection[str],
         links: np.ndarray,
         dofs: np.ndarray,
+        geoms: np.ndarray,
         constants: Callable[[mujoco.MjModel], Any] | None = None,
     ) -> None:
         """Copies the nominal properties of the first model.
@@ -62,13 +63,15 @@ class Variation:
           links: body ids of the character's links, (L,); the first one is that whose centre of mass
             is displaced.
           dofs: addresses of the character's joints in qvel, whose damping is varied.
+          geoms: ids of the character's collision geoms.
           constants: called with a model after its derived quantities were recomputed.
         """
         self._world, self._varied, self._constants = world, frozenset(varied), constants
         self._links, self._dofs, model = links, dofs, world.models[0]
         touches = (model.geom_contype | model.geom_conaffinity) != 0
-        # A geom with priority, such as a ball, keeps the friction of its contacts.
-        self._slides = np.flatnonzero(touches & (model.geom_priority == 0))
+        # Another geom with priority, such as a ball, keeps the friction of its contacts.
+        own = np.isin(np.arange(model.ngeom), geoms)
+        self._slides = np.flatnonzero(touches & ((model.geom_priority == 0) | own))
         self._mass = model.body_mass[links].copy()
         self._inertia = model.body_inertia[links].copy()
         self._centre = model.body_ipos[links[0]].copy()
@@ -102,12 +105,13 @@ class Variation:
             model.geom_friction[self._slides, 0] = own.friction[env_id]
             model.pair_friction[:, :2] = own.friction[env_id]
         if 'contact_depth' in varied:
-            model.geom_solimp[self._slides, 0] = 0.0
-            model.geom_solimp[self._slides, 2] = own.contact_depth[env_id]
+            for part, rows in ((model.geom_solimp, self._slides), (model.pair_solimp, slice(None))):
+                part[rows, 0], part[rows, 2] = 0.0, own.contact_depth[env_id]
         if 'contact_time' in varied:
             # MuJoCo would use this bound, too; `properties` have what acts.
             own.contact_time[env_id] = max(own.contact_time[env_id], 2 * model.opt.timestep)
             model.geom_solref[self._slides, 0] = own.contact_time[env_id]
+            model.pair_solref[:, 0] = own.contact_time[env_id]
         if 'damping' in varied:
             model.dof_damping[self._dofs] = self._damping * own.damping[env_id]
         if varied & {'gravity', 'slope', 'slope_direction'}:

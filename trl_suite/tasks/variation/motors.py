@@ -45,7 +45,9 @@ class Motors(Component):
 
     @property
     def made_of(self) -> dict[str, tuple[str, Any]]:
-        return {'actuators': (str(self.actuators.changed), self.actuators)}
+        # The table of a file counts, not its path.
+        own = {**vars(self.actuators), 'torque_pose': self._curves}
+        return {'actuators': (str(self.actuators.changed), own)}
 
     def prepare(self, world: World) -> None:
         model, actuators = world.models[0], self.actuators

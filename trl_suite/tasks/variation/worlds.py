@@ -166,7 +166,7 @@ class Worlds(Component):
         body, varied = task.body, self._config.varied
         constants = getattr(task.root_entity, 'set_inertia', None)
         dofs = body.pose_dof[6 if self._spatial else 3 :]
-        self.variation = Variation(world, varied, body.links, dofs, constants)
+        self.variation = Variation(world, varied, body.links, dofs, body.geoms, constants)
         properties = self.variation.properties
         self.saved = (properties,)
         self.info_arrays = {'world': {name: getattr(properties, name) for name in varied}}
