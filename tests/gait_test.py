@@ -182,6 +182,9 @@ class StartTest(parameterized.TestCase):
         self.assertLess(abs(np.mean(found)), 0.01)
         self.assertBetween(np.std(np.array(found)[:, -1]), 0.03, 0.07)
         environment = make(DOG, start_noise=1.0)  # the largest
+        for _ in range(5):  # it begins on the ground, not in it
+            environment.reset()
+            self.assertFalse(Probe(environment).touching() - set(EXEMPT[DOG]))
         for step in (environment.reset(), environment.step(idle(environment))):
             self.assertTrue(np.isfinite(np.concatenate([*step.observation.values()])).all())
 

@@ -1,5 +1,6 @@
 """Tests of the imitation tasks, in the plane and in 3D: observation, reward, start, recomputed."""
 
+import dataclasses
 import itertools
 
 import mujoco
@@ -8,6 +9,7 @@ from absl.testing import parameterized
 from helpers import assert_refused, assert_uniform, build, flattened, ground, made, put
 
 from trl_suite import motion, suite, terrain
+from trl_suite.motion import quaternion
 from trl_suite.tasks.common.control import start_phases
 from trl_suite.vector import VectorEnvironment
 
@@ -396,6 +398,23 @@ class RewardTest(parameterized.TestCase):
         # By a chord of the circle of its speed.
         error = (2 * np.sin(heading / 2)) ** 2 * np.sum(velocity[:2] ** 2)
         self.assertAlmostEqual(found['com'] / 0.2, np.exp(-error), delta=2e-3)
+
+    def test_the_velocity_of_a_turning_clip_turns_in_every_cycle(self):
+        clip = motion.load('biped3d_walk')
+        angle, poses = np.linspace(0, 1, len(clip.times)), clip.poses.copy()
+        poses[:, 3:7] = quaternion.multiply(quaternion.about_z(angle), poses[:, 3:7])
+        ways = quaternion.rotate_xy(np.diff(poses[:, :2], axis=0), (angle[1:] + angle[:-1]) / 2)
+        poses[1:, :2] = poses[0, :2] + np.cumsum(ways, axis=0)
+        circle = dataclasses.replace(clip, poses=poses, turning=True)
+        environment = made('biped3d', 'position', 'plane', 'imitation', circle)
+        environment.reset()
+        for cycles in (0.4, 1.4, 3.4):
+            environment.task.clock.cycles[0], environment.task.clock.phase[0] = cycles, 0.4
+            time = cycles * circle.duration
+            pose = circle.pose(time)
+            pose[:2] = 0
+            put(environment, pose, circle.velocity(time))
+            self.assertAlmostEqual(observed_terms(environment)['com'] / 0.2, 1, delta=2e-3)
 
     @parameterized.parameters(*((name, 0) for name in RAW), ('biped3d', 1))
     def test_a_joint_error_costs_its_weight(self, name, axis):

@@ -154,6 +154,7 @@ class TrackingTask(BodyTask):
             travel=self.travel,
             period=self.period,
             along=self.along or not self._spatial,
+            turn=self.motion.heading_change if getattr(self.motion, 'turning', False) else 0.0,
             comparison=comparison(self.character, self.reference, self.terms),
         )
 
@@ -258,6 +259,7 @@ class TrackingData(NamedTuple):
       diverged: whether the physics has diverged in the last step, (n,).
       period: that of the motion, s.
       along: whether the distance travelled is along the heading at the start, not in any direction.
+      turn: change of the motion's heading per period, rad; 0 if it does not accumulate.
     """
 
     measurement: Measurement
@@ -268,6 +270,7 @@ class TrackingData(NamedTuple):
     travel: Travel
     period: float
     along: bool
+    turn: float
     comparison: Comparison
 
 

@@ -201,10 +201,13 @@ class GaitTask(Task):
         for name, (angle, rate) in start['joints'].items():
             pose[0, 3 + self.gait.number[name]] = angle
             rates[0, 3 + self.gait.number[name]] = rate
-        data = self.world.posed(body.pose_qpos, pose[0])
-        root = data.xpos[body.links[0]][::2]
-        extents = link_extents(self.world.models[0], data, body.geoms, root)
-        return pose, rates, extents[None]
+        return pose, rates, self._extents(pose[0])[None]
+
+    def _extents(self, pose: np.ndarray) -> np.ndarray:
+        """Returns the extents of the geoms in a pose (D,), (3, G)."""
+        data = self.world.posed(self.body.pose_qpos, pose)
+        root = data.xpos[self.body.links[0]][::2]
+        return link_extents(self.world.models[0], data, self.body.geoms, root)
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         poses, rates, extents = (np.repeat(part, len(env_ids), axis=0) for part in self._start)
@@ -214,6 +217,8 @@ class GaitTask(Task):
             poses[k, 3:] += noise[0]
             rates[k, 3:] += 10 * noise[1]
             rates[k, 0] += 10 * push
+            if self.config.start_noise:
+                extents[k] = self._extents(poses[k])
             strip = PlanarGround(
                 self.arena.terrain,
                 self.terrain_seed(i, random_state),

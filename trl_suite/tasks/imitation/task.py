@@ -45,7 +45,8 @@ def compare(i: int, data: TrackingData) -> None:
     row, fraction = moment(data.clock.phase[i], 0, comparison.tracks)
     pose, velocity, height = motion_errors(i, row, fraction, comparison, measurement)
     end_effector = effector_error(i, row, fraction, comparison, measurement)
-    com = com_error(i, row, fraction, 0.0, comparison, measurement)
+    turned = np.floor(data.clock.cycles[i]) * data.turn
+    com = com_error(i, row, fraction, turned, comparison, measurement)
     terms, outcome = comparison.terms, data.outcome
     score_tracking(i, pose, velocity, end_effector, com, height, terms, outcome)
 
