@@ -91,7 +91,7 @@ CYCLES: dict[str, Any] = {
 
 
 def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -> dict[str, Any]:
-    """Trains with random first actions instead of those of a shipped policy."""
+    """Trains from a new network, without first actions of a shipped policy."""
     common: dict[str, Any] = {'samples': cycles, 'evaluate_every': cycles / 4}
     if action == 'ppo':
         curve = ppo.train(DOG, seed, settings.settings_for(DOG, **CYCLES, **common), folder, 1)

@@ -1,4 +1,4 @@
-"""Measures which falls other actions could have prevented, and writes trained/oracles.json.
+"""Measures which falls other actions could have prevented; of shipped policies it writes trained/oracles.json.
 
     python training/oracles.py FSM_Dog2D_Terrain_Mixed-v0 --falls 24
     python training/oracles.py PD_Raptor2D_Mixed_Terrain-v0 --falls 32 --tries 32
@@ -231,7 +231,8 @@ def main() -> None:
         found['cpu_seconds'] = round(time.process_time() - begin)
         print(id_, found, flush=True)
         key = f'{id_}: {condition}' if condition else id_
-        runs.enter('oracles.json' if gait else 'oracle_falls.json', key, found)
+        if not arguments.policy:
+            runs.enter('oracles.json' if gait else 'oracle_falls.json', key, found)
 
 
 if __name__ == '__main__':

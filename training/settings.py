@@ -701,8 +701,11 @@ def matching(id_: str, rows: Iterable[Row]) -> dict[str, Any]:
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
-    """Returns the settings of an environment."""
-    return Settings(**{**matching(id_, OVERRIDES), **changes})
+    """Returns the settings of an environment; samples among the changes are those of each further run."""
+    found = {**matching(id_, OVERRIDES), **changes}
+    each = {'samples': changes['samples']} if 'samples' in changes else {}
+    further = tuple({**run, **each} for run in found.get('further', ()))
+    return Settings(**{**found, 'further': further})
 
 
 def randomized_settings_for(id_: str, **changes: Any) -> Settings:

@@ -10,8 +10,9 @@ its mean distance is not below the interval of the default gait. Of several pref
 gait (`Policy.with_preference`) the best one is used, measured with another seed.
 
 Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
-environment in which it was trained; `preference`, if it is not 0; `evaluation`, its results; and
-`shipped_again`, those in episodes that had no part in the choice.
+environment in which it was trained; `of`, its digest; `preference`, if it is not 0; `evaluation`, its
+results; and `shipped_again`, those in episodes that had no part in the choice. After the policy has been
+replaced its results are replaced, too, also by lower ones.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ import train_all
 from trl_suite import evaluation, policies, suite
 from trl_suite.cli.arguments import positive
 from trl_suite.environments import named_policies
+from trl_suite.util.digest import digest
 from trl_suite.util.program import begin_script
 
 
 def stored(id_: str, episodes: int) -> dict[str, Any] | None:
     """Returns the results of the shipped policy, if it was evaluated in as many episodes."""
     shared, own = runs.read(policies.SHARED), runs.read(f'{id_}.json')
+    if replaced(id_):
+        return None
     if id_ in shared:
         found = shared[id_]['evaluation']
     elif own:
@@ -40,6 +44,12 @@ def stored(id_: str, episodes: int) -> dict[str, Any] | None:
         return None
     asked = {'episodes': episodes, 'seed': train_all.SEED}
     return found if {name: found[name] for name in asked} == asked else None
+
+
+def replaced(id_: str) -> bool:
+    """Returns whether the policy that an environment shares is another one than that of its results."""
+    entry = runs.read(policies.SHARED).get(id_)
+    return entry is not None and entry.get('of') != digest(policies.reference(id_))
 
 
 def preferring(
@@ -96,7 +106,7 @@ def main() -> None:
             flush=True,
         )
         low, high = before['distance_interval']
-        if found['distance'] <= (high if has_policy else low):
+        if found['distance'] <= (high if has_policy else low) and not replaced(id_):
             continue
         entry = {
             'policy': of, **({'preference': preference} if preference else {}), 'evaluation': found,
@@ -105,6 +115,7 @@ def main() -> None:
             ),
         }  # fmt: skip
         runs.enter(policies.SHARED, id_, entry)
+        runs.add(policies.SHARED, id_, 'of', digest(policies.reference(id_)))
         with runs.changing(policies.SHARED) as shared:  # no other process changes it meanwhile
             remove_unused(shared)
 

@@ -267,8 +267,9 @@ def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     settings = curve['settings']
     # The last policy is used with curriculum stages, because the curve does not measure all skills,
     # and if it only imitates, because it has learnt from the most data.
-    imitates = settings.get('cloned', 0) >= settings['samples']
-    name = 'last' if settings.get('stages') or imitates else 'policy'
+    own = {**settings, **(settings.get('further') or [{}])[-1]}  # of the last run
+    imitates = own.get('cloned', 0) >= own['samples']
+    name = 'last' if own.get('stages') or imitates else 'policy'
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     found = evaluation.evaluate(id_, policy, episodes_of(id_), SEED, num_threads=1)
     entry = {
@@ -374,6 +375,8 @@ def parsed(words: Sequence[str] | None) -> argparse.Namespace:
     checked('--samples', chosen.samples, float | None, above=0)
     for seed in chosen.seeds:
         errors.check_known('seed of the runs', map(str, COMPARED_SEEDS), str(seed))
+    if chosen.address and not chosen.ray:
+        raise ValueError(f'--address is {chosen.address!r}; expected --ray with it')
     if '://' in chosen.runs and not chosen.ray:
         raise ValueError(f'--runs is {chosen.runs!r}; expected a folder, or a URL with --ray')
     return chosen

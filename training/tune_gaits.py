@@ -420,6 +420,11 @@ def parsed() -> argparse.Namespace:
     needed = needs.get(arguments.action)
     if needed and getattr(arguments, needed) is None:
         parser.error(f'{arguments.action} needs --{needed}')
+    for option, users in (('terrain', ('complement', 'alone')), ('length', ('steady',))):
+        if getattr(arguments, option) is not None and arguments.action not in users:
+            parser.error(f'{arguments.action} takes no --{option}')
+    if arguments.action in ('default', 'steady') and len(arguments.start or ()) > 1:
+        parser.error(f'{arguments.action} takes one --start')
     if arguments.length is not None and not 0 < arguments.length < np.inf:
         parser.error(f'argument --length: {arguments.length}; expected a length above 0 m')
     return arguments

@@ -369,9 +369,10 @@ class JobsTest(FolderTest):
         id_, of = 'FSM_Dog2D_Terrain_Gaps-v0', 'FSM_Dog2D_Terrain_Mixed-v0'
         policy = policies.reference(of)
         again = {'seed': train_all.OTHER_SEED, 'episodes': train_all.GAIT_EPISODES}
+        values = [100.0]
 
         def evaluate(id_, policy, episodes, seed, *options, factory=False, **more):
-            distance = 100.0 - 90 * factory
+            distance = values[-1] - 90 * factory
             return {
                 'seed': seed, 'episodes': episodes, 'distance': distance,
                 'median_distance': distance, 'distance_interval': [distance] * 2,
@@ -387,6 +388,13 @@ class JobsTest(FolderTest):
             for found in (runs.read(f'{of}.json'), runs.read(policies.SHARED)[id_]):
                 self.assertEqual(found['shipped_again'] | again, found['shipped_again'])
             self.assertEqual(runs.read(policies.SHARED)[id_]['evaluation']['seed'], train_all.SEED)
+            # The results of a policy that is replaced are replaced, too, also by lower ones.
+            values.append(50.0)
+            output(share_gaits.main, of, id_)
+            self.assertEqual(runs.read(policies.SHARED)[id_]['evaluation']['distance'], 100.0)
+            policies.save(policy.with_preference(0.1), runs.place(f'{of}.npz'))
+            output(share_gaits.main, of, id_)
+            self.assertEqual(runs.read(policies.SHARED)[id_]['evaluation']['distance'], 50.0)
 
     def test_a_policy_that_others_use_is_kept(self):
         for id_ in 'abcd':
@@ -701,7 +709,7 @@ class RecordsTest(absltest.TestCase):
                 named[path.with_suffix('.npz')] = (
                     of['evaluations'] if variant == 'randomized' else of
                 )
-        for table in ('stairs.json', 'ramps.json'):
+        for table in ('stairs.json', 'ramps.json', policies.SHARED):
             for id_, found in runs.read(table).items():
                 named[table, id_] = found['of']
         named = {key: of for key, of in named.items() if of}
@@ -809,6 +817,8 @@ class TrimTest(FolderTest):
         ):
             self.assertEqual(train_all.program(id_).__name__, program)
             self.assertIn('samples', train_all.settings(id_))
+        own = train_all.settings('PD_Dog2D_Walls_Terrain-v0', 7e3)  # of every run
+        self.assertEqual([own['samples'], *(run['samples'] for run in own['further'])], [7e3, 7e3])
 
     def test_old_entries_get_new_settings(self):
         id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
@@ -933,6 +943,7 @@ class ProgramsTest(FolderTest):
         (train_all, '--samples -1', '--samples is -1.0; expected'),
         (train_all, '--seeds -1', "unknown seed of the runs '-1'"),
         (train_all, '--runs s3://a/b', "--runs is 's3://a/b'; expected a folder, or a URL with --ray"),
+        (train_all, '--address auto', "--address is 'auto'; expected --ray with it"),
         (compare, 'actions --samples 0', '--samples is 0.0; expected a number above 0'),
         (compare, 'actions --seeds -1', r'--seeds is \[-1\]; expected'),
         (compare, 'actions --seeds 1 0', '--seeds: 0 is the seed of the tests; choose another'),
