@@ -103,7 +103,7 @@ setup(
         'pyopengl',
         'scipy',
         'tqdm',
-        'trimesh',
+        'trimesh>=4.6',
     ],
     extras_require={
         'policies': [f'trl_suite_policies=={VERSION}'],
@@ -112,7 +112,7 @@ setup(
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
         'benchmark': ['gymnasium>=1.1', 'stable-baselines3>=2.7', 'sb3-contrib>=2.7', TORCH],
-        'minari': [MINARI],
+        'minari': ['gymnasium>=1.1', MINARI],
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
         'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],
         'cluster': [f'ray{RAY}', 'fsspec'],

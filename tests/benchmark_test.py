@@ -319,6 +319,10 @@ class ReportCommandTest(CommandTest):
         pathlib.Path('nothing.json').write_text(json.dumps(nothing))
         with self.assertRaisesRegex(ValueError, 'scores: None stages; expected 20'):
             benchmark.BENCHMARK.read('nothing.json', complete=False)
+        hollow = {**unfinished, 'metrics': {}, **{name: [] for name in results.ROWS}}
+        pathlib.Path('nothing.json').write_text(json.dumps(hollow))
+        with self.assertRaisesRegex(ValueError, 'scores: 0 stages; expected 20'):
+            benchmark.BENCHMARK.read('nothing.json', complete=False)
         self.assert_refused(
             'in a folder of results',
             'benchmark',

@@ -363,8 +363,10 @@ class LimitsTest(FolderTest):
         for module in ('pickle', 'resource', 'numpy', 'mujoco'):
             (self.folder / f'{module}.py').write_text('raise SystemExit("was run")')
         (self.folder / 'm.xml').write_text(model())
-        with contextlib.chdir(self.folder):
-            self.assertEqual(characters.from_file('m.xml').links, ('trunk', 'leg'))
+        # An interactive session imports from the working folder, '', first.
+        for places in (sys.path, ['', *sys.path]):
+            with contextlib.chdir(self.folder), mock.patch.object(sys, 'path', places):
+                self.assertEqual(characters.from_file('m.xml').links, ('trunk', 'leg'))
 
     def test_a_long_chain_of_files_is_read(self):
         for file, text in chain(1500, 1).items():

@@ -287,9 +287,11 @@ class Keeper(Counter):
 def made_up(cases, episodes, seeds, threads, executor):
     """Scores instead of those of `evaluation.evaluate_all`: 0.04 more after every stage."""
     assert min(seeds) >= 2**31 and len(seeds) == episodes
-    for spec, stages in cases:
-        place = SHORT.ids.index(spec.id) if spec.id in SHORT.ids else 0
-        yield {'normalized_return': 0.04 * stages + 0.01 * place}
+    places = [SHORT.ids.index(spec.id) if spec.id in SHORT.ids else 0 for spec, _ in cases]
+    return [
+        {'normalized_return': 0.04 * stages + 0.01 * place, 'cpu': 'x86_64 elsewhere'}
+        for place, (_, stages) in zip(places, cases, strict=True)
+    ]
 
 
 class RunCase(FolderTest):
@@ -311,6 +313,8 @@ class RunTest(RunCase):
         learner, executor = Counter(), object()
         result = self.run_short(learner, seed=3, episodes=2, num_threads=5, executor=executor)
         self.assertEqual(learner.history, [[id_, 7, 3] for id_ in SHORT.ids])
+        # Of this process, and where the executor tested.
+        self.assertEqual(result['cpu'], f'{machine.cpu_class()}, x86_64 elsewhere')
         tests = [mock.call(mock.ANY, 2, runs.test_seeds(2, 3), 5, executor=executor)] * 4
         self.assertEqual(self.tests.call_args_list, tests)
         np.testing.assert_allclose(result['initial'], [0, 0.01, 0.02])

@@ -93,7 +93,7 @@ class StableBaselinesTest(parameterized.TestCase):
 
     def test_options_choose_levels(self):
         envs = SuiteVecEnv(GAPS, 3, 1, seed=0, task_kwargs={'levels': (0, 1000)})
-        envs.set_options([{'level': 7}, {}, {'level': 9}])
+        envs.set_options([{'level': 7}, {'level': None}, {'level': 9}])
         envs.reset()
         self.assertEqual(envs.environment.level[[0, 2]].tolist(), [7, 9])
         envs.reset()

@@ -46,7 +46,10 @@ def connect(address: str | None = None) -> None:
       ConnectionError: there is no cluster at this address.
       ray.exceptions.AuthenticationError: the cluster has a token, and this machine has not.
     """
-    if not (address or os.environ.get('RAY_ADDRESS', '')).startswith('ray://'):
+    target = address
+    if address in (None, 'auto'):
+        target = os.environ.get('RAY_ADDRESS')
+    if not (target or '').startswith('ray://'):
         found = services.canonicalize_bootstrap_address(address)  # HOST:PORT; None for 'local'
         try:
             if found is not None:
@@ -139,7 +142,7 @@ class RayExecutor:
         except ray.exceptions.RayTaskError as error:
             raise error.cause from error
         finally:
-            for task in tasks:
+            for task in tasks if ray.is_initialized() else ():  # else Ray would start again
                 ray.cancel(task)
             self._tasks.difference_update(tasks)
 

@@ -91,7 +91,8 @@ class SuiteVecEnv(VecEnv):
         """Starts an episode in every simulation; `set_options` may have set its 'level'."""
         for options in self._options:
             errors.check_known('option of reset', ('level',), *options)
-        levels = {i: each['level'] for i, each in enumerate(self._options) if 'level' in each}
+        given = (each.get('level') for each in self._options)  # None: it is drawn
+        levels = {i: level for i, level in enumerate(given) if level is not None}
         with self.environment.core as core:
             if levels:
                 core.task.choose_level([*levels], [*levels.values()])

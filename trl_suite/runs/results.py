@@ -175,7 +175,7 @@ def _check_rows(result: dict[str, Any], course: Course, complete: bool) -> None:
     """Checks numbers and shapes of everything that was measured."""
     tasks, stages = len(course), len(course.stages)
     _check_numbers('initial', result['initial'], tasks, at_most=1)
-    if not complete and isinstance(result['scores'], list):
+    if not complete and 'metrics' not in result and isinstance(result['scores'], list):
         stages = min(len(result['scores']), stages)
     for name in ROWS:
         if not isinstance(result[name], list) or len(result[name]) != stages:

@@ -144,7 +144,13 @@ class Benchmark(results.Format):
             'ids': list(course.ids), 'budget': int(budget), 'episodes': int(episodes),
             'seed': int(seed), 'initial': [], **{name: [] for name in results.ROWS},
         }  # fmt: skip
-        test = (episodes, seed, num_threads, executor)
+
+        def tested(policy: Callable[[np.ndarray], np.ndarray]) -> list[float]:
+            found = self._tested(course, policy, episodes, seed, num_threads, executor)
+            if executor is not None and 'cpu' in result:  # it may have tested on other processors
+                result['cpu'] = _joined(result['cpu'], *(each['cpu'] for each in found))
+            return [each[SCORE] for each in found]
+
         what = f'writes {path}; wait for it, or choose another path'
         with files.locked(path.with_name(f'.{path.name}.lock'), what):
             if path.exists():
@@ -158,7 +164,7 @@ class Benchmark(results.Format):
                 for own in (path.with_suffix('.npz'), *(_state(path, n) for n in range(1, count))):
                     if os.path.lexists(own):
                         raise FileExistsError(f'{own}: exists; remove it, or choose another result')
-                result['initial'] = self.scores(course, learner.policy(), *test)
+                result['initial'] = tested(learner.policy())
                 _write(path, result)
             done = len(result['scores'])
             _forget(path, done)  # the run may have been killed before it did so
@@ -176,7 +182,7 @@ class Benchmark(results.Format):
                     result['samples'].append(stage.samples.tolist())
                     result['curves'].append(stage.curve())
                     policy = learner.policy()
-                    result['scores'].append(self.scores(course, policy, *test))
+                    result['scores'].append(tested(policy))
                     if number == count - 1:
                         if isinstance(policy, policies.Policy):
                             policies.save(policy, path.with_suffix('.npz'))
@@ -218,11 +224,23 @@ class Benchmark(results.Format):
           ValueError: invalid numbers.
         """
         course = self.get(course) if isinstance(course, str) else course
+        found = self._tested(course, policy, episodes, seed, num_threads, executor)
+        return [each[SCORE] for each in found]
+
+    def _tested(
+        self,
+        course: Course,
+        policy: Callable[[np.ndarray], np.ndarray],
+        episodes: int,
+        seed: int,
+        num_threads: int,
+        executor: evaluation.Executor | None,
+    ) -> list[dict[str, Any]]:
+        """Returns the results of `evaluation.evaluate` for each environment; see `scores`."""
         seed = checked('seed', seed, int, at_least=0, at_most=results.LARGEST_SEED)
         seeds = test_seeds(episodes, seed)
         cases = [(course.spec(id), policy) for id in course.ids]
-        found = evaluation.evaluate_all(cases, episodes, seeds, num_threads, executor=executor)
-        return [result[SCORE] for result in found]
+        return evaluation.evaluate_all(cases, episodes, seeds, num_threads, executor=executor)
 
     def verify(
         self, path: str | os.PathLike[str], num_threads: int = 0
@@ -292,9 +310,13 @@ class Benchmark(results.Format):
                 )
             learner.load(state)
         if done < stages and 'cpu' in result:
-            cpus = [*result['cpu'].split(', '), expected['cpu']]
-            result['cpu'] = ', '.join(dict.fromkeys(cpus))
+            result['cpu'] = _joined(result['cpu'], expected['cpu'])
         return result
+
+
+def _joined(*cpus: str) -> str:
+    """Returns all classes of CPU that are in these lists."""
+    return ', '.join(dict.fromkeys(cpu for each in cpus for cpu in each.split(', ')))
 
 
 def _sha256(path: pathlib.Path) -> str:

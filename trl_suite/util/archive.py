@@ -21,12 +21,15 @@ def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
     """Writes an archive; an existing file is replaced only when the new one is complete.
 
     Raises:
-      ValueError: another suffix than .npz.
+      ValueError: another suffix than .npz, or a field that would be pickled.
       OSError: the file cannot be written.
     """
-    arrays = {name: np.asarray(value) for name, value in fields.items()}
+    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in fields.items()}
+    for name, array in arrays.items():  # NumPy before 2.2 cannot be told not to pickle
+        if array.dtype.hasobject:
+            raise ValueError(f'field {name!r}: holds objects; expected numbers or text')
     with replacing(check_path(path, ('.npz',))) as part, part.open('wb') as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+        np.savez_compressed(file, **arrays)
 
 
 Forms = dict[str, tuple[str, int]]  # by field: the kinds of dtypes, and the number of axes

@@ -99,8 +99,8 @@ def floats(
         raise ValueError(f'{name}: expected an array of numbers: {error}') from None
     if shape is not None and array.shape != shape:
         raise ValueError(f'{name}: has shape {array.shape}; expected {shape}')
-    good = np.isfinite(array) & (np.abs(array) <= most)
-    if not (good | np.isnan(array) if missing else good).all():
+    good = (np.isfinite(array) & (np.abs(array) <= most)) | (missing & np.isnan(array))
+    if not good.all():
         index = np.argwhere(~good)[0].tolist()
         bound = '' if most == math.inf else f' of at most {most:g}'
         raise ValueError(f'{name}: {array[*index]} at {index}; expected finite numbers{bound}')

@@ -40,7 +40,7 @@ def call(function: Callable[..., Any], *arguments: Any) -> Any:
       RuntimeError: the process does not start.
     """
     code = (
-        f'import sys; sys.path[:] = {[*map(str, sys.path)]!r}; from {__name__} import _serve; '
+        f'import sys; sys.path[:] = {[str(place) for place in sys.path if place]!r}; from {__name__} import _serve; '
         f'_serve({SECONDS}, {MEMORY})'
     )
     try:
