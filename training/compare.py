@@ -119,9 +119,7 @@ def train_changes(cell: str, seed: int, cycles: float, folder: pathlib.Path) -> 
     folder.mkdir(parents=True, exist_ok=True)
     initial = dataclasses.replace(shipped, convolution=convolution, weights=weights, biases=biases)
     policies.save(initial, first)
-    if (
-        cell == 'initial'
-    ):  # other episodes for each seed, so that the table shows how much these matter
+    if cell == 'initial':  # other episodes for each seed: the table shows how much these matter
         found = evaluation.evaluate(CHANGED, initial, ACTION_EPISODES, SEED + seed, 1)
         return {**{key: found[key] for key in MEASURED}, 'curve': [[0, found['distance']]]}
     asked = refine_gaits.settings_for(
