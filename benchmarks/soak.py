@@ -173,10 +173,8 @@ def main():
         spec, own = SPECS[i], int(random.integers(2**32))
         found = soak(spec, arguments.each, arguments.num_envs, arguments.threads, own)
         steps += found['control_steps']
-        run['seconds'], run['environments'] = (
-            round(time.time() - begin, 1),
-            run['environments'] + 1,
-        )
+        run['seconds'] = round(time.time() - begin, 1)
+        run['environments'] += 1
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
         with files.changing(path, NEW, indent=None) as figures:
             if found['not_finite']:

@@ -112,11 +112,15 @@ def main() -> None:
         id_, begin = suite.find(name).id, time.process_time()
         learn_gaits.environments_of(id_, learn_gaits.Settings())  # it has a gait
         policy, rng = policies.reference(id_), np.random.default_rng(arguments.seed)
-        assert policy.choices is not None  # those of gaits select base actions
-        base = policy.choices.astype(float)
         options = {'autoreset': 'disabled', 'step_limit': None}
         starts = VectorEnvironment(id_, arguments.terrains, 1, arguments.seed, **options)
         starts.reset()
+        gait = starts.task.gait.parameters
+        base = (
+            gait.action(gait.base_actions)
+            if policy.choices is None
+            else policy.choices.astype(float)
+        )
         copies = VectorEnvironment(id_, COPIES, 1, arguments.seed, **options)
         copies.reset()
         enough = arguments.metres, int(arguments.budget)

@@ -182,6 +182,14 @@ def settings_for(id_: str, **changes: Any) -> Settings:
     return Settings(**{**matching(id_, OVERRIDES.items()), **changes})
 
 
+def zero_layer(inputs: int, outputs: int) -> nn.Linear:
+    """Returns a layer whose outputs are 0."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
 class Network(nn.Module):
     """A network for the values of all actions; the first `line` inputs are ground heights.
 
@@ -205,9 +213,7 @@ class Network(nn.Module):
         self.last = nn.Linear(sizes[-1], choices[0])
         self.choices, self.actors = choices, None
         if settings.actors:
-            self.actors = nn.Linear(sizes[-1], choices[0] * choices[1])
-            nn.init.zeros_(self.actors.weight)
-            nn.init.zeros_(self.actors.bias)
+            self.actors = zero_layer(sizes[-1], choices[0] * choices[1])
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.last(self.features(x))

@@ -173,14 +173,6 @@ def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
     return own
 
 
-def zero_layer(inputs: int, outputs: int) -> nn.Linear:
-    """Returns a layer whose outputs are 0."""
-    layer = nn.Linear(inputs, outputs)
-    nn.init.zeros_(layer.weight)
-    nn.init.zeros_(layer.bias)
-    return layer
-
-
 def of_action(changes: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
     """Returns the changes (n, a) of base actions from those of each of them, or of all."""
     return changes[torch.arange(len(number)), number.clamp(max=changes.shape[1] - 1)]
@@ -203,7 +195,7 @@ class Refiner:
         networks = [copy.deepcopy(learner.network) for _ in initial.networks]
         self.value = copy.deepcopy(learner.network)
         features = self.value.last.in_features
-        self.value.last = zero_layer(features, 1)
+        self.value.last = learn_gaits.zero_layer(features, 1)
         count, size = learner.choices.shape
         changes = {'': 0, 'all': size, 'each': count * size}[s.changes]
         known = initial.biases[-1].shape[-1] - len(initial.choices)
@@ -217,7 +209,7 @@ class Refiner:
             )
         for number, network in enumerate(networks):
             if changes:
-                network.actors = zero_layer(features, changes)
+                network.actors = learn_gaits.zero_layer(features, changes)
             learner.copy_weights(initial, number, network)
         self.policy = nn.ModuleList(networks)
         cycles = s.num_envs * s.horizon

@@ -371,10 +371,7 @@ def plot(entries: dict[str, dict[str, Any]]) -> None:
             name = next((name for tag, name in PANELS.items() if tag in spec.tags), spec.character)
             panels.setdefault((spec.domain, name), []).append(id_)
     rows = -(-len(panels) // 3)
-    with picture(PICTURE, rows, 3, figsize=(13, 4.2 * rows), sharey=True) as (
-        _,
-        axes,
-    ):
+    with picture(PICTURE, rows, 3, figsize=(13, 4.2 * rows), sharey=True) as (_, axes):
         for axis, ((domain, name), ids) in zip(axes.flat, panels.items(), strict=False):
             lengths = []
             colours = colormaps['tab10' if len(ids) <= 10 else 'tab20'].colors

@@ -668,6 +668,9 @@ OVERRIDES: tuple[Row, ...] = (
     ('FSM_*', {'samples': 1e6, 'least_share': {}, 'evaluation_episodes': 16}),  # a step is a cycle
 )  # fmt: skip
 
+# Gaits whose policy sets all parameters; of the others it selects a base action, see `learn_gaits.py`.
+EVERY_PARAMETER = ('FSM_Hopper2D_Terrain_Gaps-v0',)
+
 # Policies for worlds and sensors that vary, in `trained/randomized`: `train_randomized.py` continues
 # the training of shipped ones with this preset of `randomize` and `sensors`. Low learning rates, to
 # avoid forgetting.

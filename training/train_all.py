@@ -6,7 +6,7 @@
     python training/train_all.py --filter FSM_Goat2D_Terrain_Cliffs-v0
     python training/train_all.py --ray                 # on all cores, or on those of a cluster
 
-Each run is `ppo.py` on one thread, or for gait environments (FSM_...) `learn_gaits.py` or
+Each run is `ppo.py` on one thread, or for most gait environments (FSM_...) `learn_gaits.py` or
 `refine_gaits.py`. A run that uses the policy of another environment, as initial policy or as footstep
 controller, starts after the runs of that environment. Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
 into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
@@ -44,6 +44,7 @@ import refine_gaits
 import runs
 import tqdm
 from networks import trimmed
+from settings import EVERY_PARAMETER
 
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
@@ -65,7 +66,7 @@ GAITS = (  # gait environments that are trained by default
     *(f'FSM_Dog2D_Terrain_{name}-v0' for name in ('Mixed', 'Cliffs', 'Slopes_Mixed', 'Stairs_Rugged')),
     *(f'FSM_Raptor2D_Terrain_{name}-v0' for name in ('Mixed', 'Slopes_Mixed', 'Narrow_Gaps')),
     *(f'FSM_Goat2D_Terrain_{name}-v0' for name in ('Cliffs', 'Variable_Steps')),
-    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0', *EVERY_PARAMETER,
 )  # fmt: skip
 
 
@@ -96,7 +97,7 @@ def shipped(entry: dict[str, Any]) -> dict[str, Any]:
 
 def program(id_: str) -> ModuleType:
     """Returns the program that trains an environment."""
-    if catalogue.BY_ID[id_].actuation != 'gait':
+    if catalogue.BY_ID[id_].actuation != 'gait' or id_ in EVERY_PARAMETER:
         return ppo
     return refine_gaits if id_ in refine_gaits.OVERRIDES else learn_gaits
 

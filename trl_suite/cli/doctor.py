@@ -19,7 +19,7 @@ import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from trl_suite import policies
@@ -260,20 +260,14 @@ def _end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
     return run.returncode, out.strip(), lines[-1].strip()
 
 
-def report(found: Iterable[Finding]) -> Iterator[str]:
-    """Yields lines, with remedies indented below their findings."""
-    for finding in found:
-        yield f'{finding.state:<6}  {finding.text}'
-        if finding.remedy:
-            yield f'        -> {finding.remedy}'
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Prints all findings, and returns 1 if any check failed."""
     found = []
     for finding in findings():  # some take seconds
         found.append(finding.state)
-        print('\n'.join(report([finding])), flush=True)
+        print(f'{finding.state:<6}  {finding.text}', flush=True)
+        if finding.remedy:
+            print(f'        -> {finding.remedy}', flush=True)
     failed = found.count(FAILED)
     print(
         f'\n{failed} check{"" if failed == 1 else "s"} failed' if failed else '\nall checks passed'

@@ -158,9 +158,8 @@ def _plot_maps(
         starts.append(ground.spawn(np.random.default_rng(sequence)))
         # Line by line, as each line intersects few of the boxes.
         heights = np.stack([ground.height(places, y) for y in places])
-        maps.append(
-            np.where(np.isfinite(heights), heights, np.nan)
-        )  # nothing where there is no ground
+        heights[~np.isfinite(heights)] = np.nan  # where there is no ground
+        maps.append(heights)
     low, high = float(np.nanmin(maps)), float(np.nanmax(maps))
     if low == high:
         low, high = low - 0.5, high + 0.5

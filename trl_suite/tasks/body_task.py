@@ -41,9 +41,7 @@ class BodyTask(Task):
         the observations of current states, after the bodies were measured.
     """
 
-    ABOUT_COM = (
-        True  # whether end effector positions are relative to the centre of mass, not to the root
-    )
+    ABOUT_COM = True  # end effectors are relative to the centre of mass, not to the root
     length = 0.0  # m; of the step of a library with which episodes start
     strain = True  # whether the strain of muscles is observed
     body: Any  # PlanarBody or SpatialBody
@@ -144,9 +142,8 @@ class BodyTask(Task):
             array[env_ids] = 0
         self._placed(env_ids)
         self.observe(env_ids)
-        self.outcome.reward_terms[env_ids] = (
-            0.0  # `observe_all` may have written those of the start
-        )
+        # `observe_all` may have written those of the start.
+        self.outcome.reward_terms[env_ids] = 0.0
 
     def _begin_clocks(self, env_ids: np.ndarray) -> None:
         """Sets the clocks of some simulations to `clock.start`."""

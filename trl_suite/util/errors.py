@@ -89,10 +89,9 @@ def floats(
       ValueError: anything else; the message has the name, and the index of a number.
     """
     try:
-        if (
-            np.asarray(value).dtype.kind not in 'fiubO'
-        ):  # NumPy would turn texts and dates into numbers
-            raise ValueError(f'the type is {np.asarray(value).dtype}')
+        found = np.asarray(value).dtype
+        if found.kind not in 'fiubO':  # NumPy would turn texts and dates into numbers
+            raise ValueError(f'the type is {found}')
         with np.errstate(over='ignore'):
             array = np.array(value, dtype, order='C')
     except (TypeError, ValueError, OverflowError) as error:

@@ -27,9 +27,8 @@ from numba.extending import (
 )
 
 _WORD = 8  # bytes; a block consists of words of this size
-_array_types: dict[
-    tuple[np.dtype, int, int], types.Type
-] = {}  # `typeof` takes longer than all else
+# `typeof` takes longer than all else.
+_array_types: dict[tuple[np.dtype, int, int], types.Type] = {}
 
 
 class Field(NamedTuple):

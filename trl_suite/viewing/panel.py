@@ -19,19 +19,9 @@ SPEEDS = {'1/8': 0.125, '1/4': 0.25, '1/2': 0.5, '1': 1.0, '2': 2.0, '4': 4.0}
 PUSH = (0.1, 5.0, 1.0)  # m/s; minimum, maximum, initial value
 SLIDER_STEPS = 100
 COLOURS = (  # of lines, those of matplotlib
-    [
-        '#1f77b4',
-        '#ff7f0e',
-        '#2ca02c',
-        '#d62728',
-        '#9467bd',
-        '#8c564b',
-        '#e377c2',
-        '#7f7f7f',
-        '#bcbd22',
-        '#17becf',
-    ]
-)
+    '#1f77b4', '#ff7f0e', '#2ca02c', '#d62728', '#9467bd', '#8c564b', '#e377c2', '#7f7f7f', '#bcbd22',
+    '#17becf',
+)  # fmt: skip
 PLOT_HEIGHT = 180  # pixels
 LEGEND = 8  # largest number of lines of a plot with a legend
 NOTICE = 8.0  # s; how long a message stays

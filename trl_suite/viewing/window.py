@@ -56,9 +56,7 @@ def following(environment: Environment) -> Any:
     task, model = environment.task, environment.physics.model
     camera = wrapper.MjvCamera()
     camera.type_ = mujoco.mjtCamera.mjCAMERA_TRACKING
-    camera.fixedcamid, camera.trackbodyid = (
-        -1,
-        int(model.jnt_bodyid[overlays.root_joint(model, task)]),
-    )
+    camera.trackbodyid = int(model.jnt_bodyid[overlays.root_joint(model, task)])
+    camera.fixedcamid = -1
     camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
     return camera

@@ -54,10 +54,8 @@ SOLE, SOLE_AHEAD = (
     (0.0885, 0.045, 0.004),
     0.052,
 )  # m; half sizes of markers, distance from the ankle
-SWING_COLOUR, STANCE_COLOUR = (
-    (0.95, 0.55, 0.1, 0.9),
-    (0.15, 0.45, 0.9, 0.9),
-)  # by the foot that lands
+# By the foot that lands.
+SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)
 
 
 class FootstepPlan(NamedTuple):
