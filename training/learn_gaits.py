@@ -355,11 +355,11 @@ class Learner:
         self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
             self.expert = initial_policy(s.start)
+            self.begin_with(self.expert)
             if self.expert.biases[-1].shape[-1] > len(self.expert.choices) and not s.actors:
                 raise ValueError(
                     f'the policy of {self.expert.id} changes its base actions; expected one without changes'
                 )
-            self.begin_with(self.expert)
         self.samples = self.updates = 0
         self.renewed = 0  # number of samples when the policy last learnt with a falling rate
         self.loss = 0.0

@@ -263,7 +263,11 @@ class LearnTest(FolderTest):
         ({'also': ('FSM_Hopper2D_*',)}, '4 simulations for 10 environments'),
         ({'gaits': ('tuned',)}, "'tuned'.*did you mean"),
         ({'gaits': ('big_hop',)}, "'big_hop'.*within the action range"),
-        ({'start': HOPPER}, 'has 211 inputs, that of .* 144 inputs; .* setting view'),
+        ({'start': WALLS}, 'has 211 inputs, that of .* 144 inputs; .* setting view'),
+        (
+            {'start': HOPPER},
+            'has no convolution, that of .* a convolution',
+        ),  # it sets all parameters
     )
     def test_bad_settings_are_refused(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):

@@ -103,7 +103,10 @@ class OracleTest(absltest.TestCase):
         options = {'autoreset': 'disabled', 'step_limit': None}
         copies, rng = VectorEnvironment(HOPPER, 24, 1, 3, **options), np.random.default_rng(3)
         copies.reset()
-        start, base = copies.get_state([0]), policies.reference(HOPPER).choices
+        start, base = (
+            copies.get_state([0]),
+            policies.reference('FSM_Hopper2D_Terrain_Mixed-v0').choices,
+        )
         for noisy in (False, True):
             metres, cycles = foresight.search(copies, start, base, noisy, 9.0, 24 * 50, rng)
             self.assertBetween(metres, 9.0, 12.0)  # a hop is at most 2.4 m long
