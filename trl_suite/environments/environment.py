@@ -252,10 +252,12 @@ class Environment(composer.Environment):
         return found
 
     def reward_spec(self) -> specs.Array:
+        """Returns the specification of rewards; raises RuntimeError after `close`."""
         self.core.usable()
         return super().reward_spec()
 
     def discount_spec(self) -> specs.BoundedArray:
+        """Returns the specification of discounts; raises RuntimeError after `close`."""
         self.core.usable()
         return super().discount_spec()
 
