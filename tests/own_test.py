@@ -71,6 +71,16 @@ class WrittenTest(FolderTest):
         return path
 
 
+def with_named_shins(attributes=''):
+    """Returns MJCF whose geoms of the shins are called right and left."""
+    text = MJCF
+    for side in ('right', 'left'):
+        shin = f'name="{side}_knee" axis="0 -1 0" range="-120 0"/>\n<geom '
+        assert shin in text
+        text = text.replace(shin, f'{shin}name="{side}" {attributes} ')
+    return text
+
+
 def compiled(row):
     root = characters.make(row).mjcf_model
     return mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
@@ -189,10 +199,7 @@ class CharacterTest(WrittenTest):
     def test_friction_and_pairs_follow_the_world(self):
         """Also of geoms whose friction has priority."""
         rules = '<contact><pair geom1="right" geom2="left"/></contact></mujoco>'
-        text = MJCF.replace('</mujoco>', rules)
-        for side in ('right', 'left'):
-            shin = f'name="{side}_knee" axis="0 -1 0" range="-120 0"/>\n<geom '
-            text = text.replace(shin, f'{shin}name="{side}" priority="1" friction="1.5" ')
+        text = with_named_shins('priority="1" friction="1.5"').replace('</mujoco>', rules)
         world = {'friction': 0.3, 'contact_depth': 0.01, 'contact_time': 0.05}
         environment = suite.build(
             self.planar(text),
@@ -227,11 +234,7 @@ class CharacterTest(WrittenTest):
             '<contact><exclude body1="world" body2="trunk"/><exclude body1="trunk" body2="left_shin"/>'
             '<pair geom1="right" geom2="left"/><pair geom1="floor" geom2="left"/></contact></mujoco>'
         )
-        text = MJCF.replace('</mujoco>', rules)
-        for side in ('right', 'left'):
-            shin = f'name="{side}_knee" axis="0 -1 0" range="-120 0"/>\n<geom '
-            self.assertIn(shin, text)
-            text = text.replace(shin, f'{shin}name="{side}" ')
+        text = with_named_shins().replace('</mujoco>', rules)
         spec = self.planar(text)
         model = compiled(spec)
         self.assertEqual((model.nexclude, model.npair), (1, 1))

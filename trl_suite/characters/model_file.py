@@ -21,16 +21,8 @@ LARGEST = 1e30  # number in a file; squares of larger ones may overflow
 MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
 # Kinds of elements, besides bodies, that need names because they are looked up later.
 _NAMED = (
-    'joints',
-    'geoms',
-    'sites',
-    'cameras',
-    'lights',
-    'equalities',
-    'excludes',
-    'pairs',
-    'tendons',
-)
+    'joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'pairs', 'tendons',
+)  # fmt: skip
 
 # Part of an error of the engine -> what it means, and the remedy.
 _REMEDIES = {
