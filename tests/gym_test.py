@@ -225,7 +225,7 @@ class SingleTest(Same, parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'seed'):
             env.reset(seed=-1)
         env.reset(seed=np.int64(3))
-        with self.assertRaises(ValueError):
+        with self.assertRaisesRegex(ValueError, r'shape \(5,\); expected \(6,\)'):
             env.step(np.zeros(5))
         env.step(idle)  # unharmed
         short = SuiteEnv(FLAT, task_kwargs={'step_limit': 1})
@@ -416,7 +416,7 @@ class VectorTest(Same, parameterized.TestCase):
             (lambda: SuiteEnv(FLAT).reset(options={'reset_mask': 1}), "unknown option of reset 'reset_mask'"),
         )  # fmt: skip
         envs.reset(seed=1)
-        with self.assertRaises(ValueError):
+        with self.assertRaisesRegex(ValueError, r'shape \(2, 5\); expected \(2, 6\)'):
             envs.step(np.zeros((2, 5)))
         envs.step(np.zeros((2, 6)))  # unharmed
 

@@ -221,6 +221,8 @@ class StageTest(absltest.TestCase):
             (lambda: make(3, seed=1), 'seed: expected none'),
             (lambda: make(3, 'plaid/dog_walls'), "of the run 'PD_Dog2D_Walls_Terrain-v0'"),
         )
+        with self.assertRaisesRegex(TypeError, 'other is Environment; expected VectorEnvironment'):
+            environments.copy_from(suite.make(SHORT.ids[0]), [0], [0])
 
     def test_curve(self):
         """Ten episodes of two steps, their limit, fill the first half of the budget."""

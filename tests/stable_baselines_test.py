@@ -123,6 +123,9 @@ class StableBaselinesTest(parameterized.TestCase):
         self.assertEqual(envs.get_attr('step_limit', [0, 2]), [256] * 2)
         self.assertEqual(envs.get_attr('seeds', [2]), [envs.environment.seeds[2]])
         self.assertFalse(envs.has_attr('terrain'))
+        self.assertTrue(envs.has_attr('reset'))
+        with self.assertRaisesRegex(TypeError, "'step_limit' is called; expected 'render'"):
+            envs.env_method('step_limit', 3)
         self.assertEqual(envs.env_is_wrapped(gymnasium.Wrapper), [False] * 3)
         for change in (lambda: envs.set_attr('step_limit', 3), lambda: envs.env_method('reset')):
             with self.assertRaisesRegex(RuntimeError, 'environment'):

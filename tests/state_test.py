@@ -616,7 +616,9 @@ class PickleTest(parameterized.TestCase):
         )  # fmt: skip
         environment.reset()
         advance(environment, 4, scale=0.2)
+        environment.step_limit = 10
         twin = pickle.loads(pickle.dumps(environment))
+        self.assertEqual(twin.step_limit, 10)
         self.assertEqual(twin.blocks, environment.blocks)
         np.testing.assert_array_equal(advance(twin, 60), advance(environment, 60))
 

@@ -233,10 +233,29 @@ class PartialBatchTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.info['ended'], [False, False, False])
         self.assertEqual(environments.core.steps.tolist(), [2, 1, 1])
 
-    @parameterized.parameters(1, 2)
-    def test_none_of_them(self, num_threads):
+    @parameterized.parameters('next_step', 'disabled')
+    def test_actions_that_are_ignored_may_be_anything(self, autoreset):
+        """Those of simulations that begin again or do not take a step; the limit is left by a reset."""
+        environments = VectorEnvironment(FLAT, 3, 1, 0, autoreset=autoreset, step_limit=2)
+        environments.reset()
+        action = np.array(IDLE)
+        action[1] = np.nan
+        environments.step(action, [0, 2])
+        environments.step(action, [0, 2])
+        np.testing.assert_array_equal(environments.at_limit, [True, False, True])
+        if autoreset == 'next_step':
+            environments.step(np.where([[True], [False], [True]], np.nan, IDLE))
+            environments.step(IDLE, [1])
+        seeds = environments.seeds
+        environments.reset(seed=4)
+        self.assertNoCommonElements(seeds.tolist(), environments.seeds.tolist())
+        self.assertFalse(environments.at_limit.any())
+        with self.assertRaisesRegex(ValueError, 'simulation 1, number 0 .* is nan'):
+            environments.step(action)
+
+    def test_none_of_them(self):
         """Loops that reset or step those that a mask names need not ask whether it names any."""
-        environments = VectorEnvironment(FLAT, 3, num_threads, 0, autoreset='disabled')
+        environments = VectorEnvironment(FLAT, 3, 1, 0, autoreset='disabled')
         before = environments.reset()
         state = pickle.dumps(environments.get_state())
         for none in ([], (), np.zeros(3, bool), np.zeros(0, int), np.zeros(0)):
@@ -452,15 +471,15 @@ import os, signal, sys
 import numpy as np
 from trl_suite.vector import VectorEnvironment
 
-make = lambda: VectorEnvironment({FLAT!r}, 2, 2, seed=0)
-roll = lambda simulations: [simulations.reset(), simulations.step(np.ones((2, 6))).observation]
+make = lambda: VectorEnvironment({FLAT!r}, 8, 2, seed=0)  # enough for two threads
+roll = lambda simulations: [simulations.reset(), simulations.step(np.ones((8, 6))).observation]
 simulations, other = make(), make()
 expected = roll(simulations)
 child = os.fork()
 if child == 0:
     signal.alarm(30)
     try:
-        simulations.step(np.ones((2, 6)))
+        simulations.step(np.ones((8, 6)))
     except RuntimeError as error:
         print(error)
     other.close()
@@ -468,7 +487,7 @@ if child == 0:
     print(np.array_equal(roll(simulations), expected), flush=True)
     LEAVE
 status = os.waitpid(child, 0)[1]
-simulations.step(np.ones((2, 6)))  # unharmed
+simulations.step(np.ones((8, 6)))  # unharmed
 print('child', status)
 """
 

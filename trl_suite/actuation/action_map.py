@@ -92,6 +92,12 @@ class ActionMap:
 
     def checked(self, action: npt.ArrayLike, *num_envs: int) -> np.ndarray:
         """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k)."""
+        action = self.numbers(action, *num_envs)
+        self.check_finite(action)
+        return action
+
+    def numbers(self, action: npt.ArrayLike, *num_envs: int) -> np.ndarray:
+        """Returns what `checked` does, without the check for NaN and infinity."""
         shape = (*num_envs, len(self))
         are, have = ('actions are', 'actions have') if num_envs else ('action is', 'action has')
         try:
@@ -103,6 +109,10 @@ class ActionMap:
             raise ValueError(f'{are} not an array of numbers: {error}') from None
         if action.shape != shape:
             raise ValueError(f'{have} shape {action.shape}; expected {shape}')
+        return action
+
+    def check_finite(self, action: np.ndarray) -> None:
+        """Raises a ValueError if a number of `numbers` is NaN or infinite."""
         # A fast test first; huge numbers fail it, but pass the second one.
         if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
             *env_id, i = np.argwhere(~np.isfinite(action))[0]
@@ -110,7 +120,6 @@ class ActionMap:
             raise ValueError(
                 f'{place} ({self.names[i]}) is {action[(*env_id, i)]}; expected finite numbers'
             )
-        return action
 
 
 class Drive(NamedTuple):

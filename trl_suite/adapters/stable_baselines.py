@@ -81,7 +81,8 @@ class SuiteVecEnv(VecEnv):
         """Reseeds all simulations, whose seeds are derived from one as in the constructor.
 
         Successive seeds have no episodes in common, as they would with the seeds s + i that
-        Stable-Baselines3 gives to environments of its own.
+        Stable-Baselines3 gives to environments of its own. Episodes that begin by themselves draw from
+        the new seeds, too.
         """
         self.environment.seed(seed)
         seeds: list[int] = self.environment.seeds.tolist()
@@ -130,13 +131,27 @@ class SuiteVecEnv(VecEnv):
         values = self._view.get_attr(attr_name)
         return [values[env_id] for env_id in self._get_indices(indices)]
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Returns whether this environment or `environment` has an attribute."""
+        return hasattr(self._view, attr_name) or hasattr(self.environment, attr_name)
+
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         self._view.set_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        return self.get_attr(method_name, indices)  # refuses methods
+        """Returns the pictures of 'render'; other methods would concern all simulations.
+
+        Raises:
+          AttributeError: there is no such method.
+          RuntimeError: another method.
+          TypeError: an attribute, or arguments of 'render'.
+        """
+        values = self.get_attr(method_name, indices)
+        if method_name != 'render' or method_args or method_kwargs:
+            raise TypeError(f"{method_name!r} is called; expected 'render', without arguments")
+        return values
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """Returns False for every simulation: none has a Gymnasium wrapper."""

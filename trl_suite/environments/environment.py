@@ -306,10 +306,11 @@ class Environment(composer.Environment):
                 'env.get_state() instead'
             )
         build, arguments = self.recipe
-        return build, arguments, self.get_state()
+        return build, arguments, {'step_limit': self.step_limit, 'state': self.get_state()}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.set_state(state)
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.step_limit = saved['step_limit']
+        self.set_state(saved['state'])
 
 
 def _colours(model: Any) -> tuple[np.ndarray, np.ndarray]:

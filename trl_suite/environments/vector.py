@@ -68,7 +68,6 @@ class VectorEnvironment:
     Attributes:
       core: the simulations, see `trl_suite.environments.core.Core`.
       num_envs: number of simulations n.
-      seeds: seed of each simulation, (n,) uint32.
       at_limit: whether the last step reached the step or time limit, also if it failed, (n,) bool.
       blocks: slice of each observation block in the flat vector.
       action_map: the map from actions to physical units.
@@ -144,7 +143,7 @@ class VectorEnvironment:
         self.core = Core(task, 'vector environment', streams, threads=True)
         self.blocks, self.action_map = dict(task.blocks), task.action_map
         self.control_timestep: float = task.control_timestep
-        self.seeds, self.at_limit = self.core.seeds, np.zeros(self.num_envs, bool)
+        self.at_limit = np.zeros(self.num_envs, bool)
         self._picture: Environment | None = None
         self.seed(seed)
 
@@ -197,6 +196,7 @@ class VectorEnvironment:
             if seed is not None:
                 self.seed(seed, ids)
             core.share(core.begin, ids)
+            self._find_limits(ids.tolist())
             return self._blocks(core.task.seen.observation.astype(self.dtype))
 
     def step(self, action: np.ndarray, env_ids: Ids = None) -> Step:
@@ -208,8 +208,8 @@ class VectorEnvironment:
             terms are 0, and their other entries of `info` are those of their last step.
 
         Raises:
-          ValueError: an action of the wrong shape, or with NaN or infinity; the message names the
-            simulation.
+          ValueError: actions of the wrong shape, or NaN or infinity in one that is not ignored; the
+            message names the simulation.
           RuntimeError: before the first reset, after `close`, in a forked process, while another
             thread uses the environment, or with autoreset 'disabled' for a simulation that has
             ended.
@@ -220,7 +220,7 @@ class VectorEnvironment:
     def _step(self, core: Core, action: np.ndarray, env_ids: Ids) -> Step:
         if core.fresh:
             raise RuntimeError('step before the first reset')
-        action, task = self.action_map.checked(action, self.num_envs), core.task
+        action, task = self.action_map.numbers(action, self.num_envs), core.task
         everyone = core.world.all_ids
         asked = everyone if env_ids is None else arguments.unique_ids(env_ids, self.num_envs)
         over = core.ended[asked]
@@ -229,6 +229,11 @@ class VectorEnvironment:
             raise RuntimeError(
                 f'simulation {resetting[0]} has ended; reset it, or choose another autoreset'
             )
+        resting = np.ones(self.num_envs, bool)
+        resting[stepped] = False
+        if len(stepped) < self.num_envs:
+            action = np.where(resting[:, None], 0.0, action)
+        self.action_map.check_finite(action)
 
         def work(part: np.ndarray) -> None:
             over = np.isin(part, resetting)
@@ -245,8 +250,6 @@ class VectorEnvironment:
         self.at_limit[stepped] = core.count(stepped, self.step_limit, self.time_limit)
         reward, terminated, info = task.seen.reward.copy(), task.seen.failed.copy(), task.info()
         if len(stepped) < self.num_envs:
-            resting = np.ones(self.num_envs, bool)
-            resting[stepped] = False
             for each in (reward, terminated, *info.get('reward_terms', {}).values()):
                 each[resting] = 0
         truncated = self.at_limit & ~terminated
@@ -276,6 +279,11 @@ class VectorEnvironment:
             ids = arguments.given_ids([env_id], self.num_envs)
             self._picture.core.write(core.read(ids), [0])
             return rendering.frame(self._picture, **options)
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """Seeds of the random streams, (n,) uint32."""
+        return self.core.seeds.copy()
 
     @property
     def level(self) -> np.ndarray | None:

@@ -197,9 +197,10 @@ class _Counted(VectorEnvironment):
         Raises:
           ValueError: a simulation that is copied has a seed for tests.
         """
-        ids, sources = given_ids(env_ids, self.num_envs), given_ids(other_ids, other.num_envs)
-        _check_training(other.seeds[sources])
+        if isinstance(other, VectorEnvironment):  # others are refused below
+            _check_training(other.seeds[given_ids(other_ids, other.num_envs)])
         super().copy_from(other, other_ids, env_ids)
+        ids, sources = given_ids(env_ids, self.num_envs), given_ids(other_ids, other.num_envs)
         self.sums[ids] = other.sums[sources] if isinstance(other, _Counted) else np.nan
 
 
