@@ -87,9 +87,8 @@ OPTIONS = (  # an id or the arguments of `suite.combine`, options; beside those 
     ('PD_Biped3D_HLC_Soccer-v0', {
         'controller': [f'PD_Biped3D_LLC_{name}_Step-v0' for name in ('General', 'HighKnees', 'Stand')],
     }),
-    ('PD_Biped3D_Terrain_Trail_Hard-v0', {
-        'reward': 'original', 'terrain_observation': (), 'goal_reached': 3.0,
-    }),
+    ('PD_Biped3D_Terrain_Trail_Hard-v0', {'reward': 'original', 'terrain_observation': ()}),
+    ('PD_Biped3D_Terrain_Trail_Hard-v0', {'goal_reached': 3.0}),
     ('PD_Biped3D_Terrain_Soccer_Hard-v0', {'terrain_observation': 'height', 'goal_reached': 2.0}),
     (('biped3d', 'torque'), {'reference_observation': True}), (('biped3d', 'velocity', 'hills3d'), {}),
     (('biped3d_full_mocap',), {'action_offset': 'original'}),

@@ -675,11 +675,12 @@ class PictureTest(parameterized.TestCase):
     """What is pointed out, and videos."""
 
     def test_markers(self):
-        for options, radius in (({}, 0.5), ({'goal_reached': 0.3}, 0.3)):
+        for options, reached in (({}, 0.5), ({'goal_reached': 0.3}, 0.3)):
             environment, _ = started(SOCCER, **options)
             *plan, disc = environment.task.markers(0)
             self.assertEqual([marker.shape for marker in plan], ['box', 'box', 'arrow'])
-            self.assertEqual((disc.shape, disc.size[0]), ('cylinder', radius))
+            self.assertEqual(disc.shape, 'cylinder')
+            self.assertAlmostEqual(np.hypot(disc.size[0], 0.2), reached)  # 0.2 m: the ball's radius
             self.assertLess(disc.size[1], 0.02)
             np.testing.assert_array_equal(disc.position, environment.task.goal[0])
         environment, _ = started(FOREST)
@@ -699,6 +700,30 @@ class PictureTest(parameterized.TestCase):
         # It stands on the ground at the goal.
         np.testing.assert_allclose(flag.position, task.goal[0] + (0, 0, half_height))
         self.assertGreater(half_height, radius)
+
+    def test_goals_are_on_boxes_where_these_are_now(self):
+        environment, _ = started(MOVERS, goal_distance=(0, 0.1))
+        task, arena, ground = (
+            environment.task,
+            environment.task.arena,
+            environment.task.arena.grounds[0],
+        )
+        begin = arena.mover_centres(0)
+        for _ in range(12):
+            environment.step(AHEAD)
+        now = arena.mover_centres(0)
+        moved = np.flatnonzero(np.hypot(*(now - begin).T) > 2)
+        self.assertNotEmpty(moved)
+        for k in moved:
+            task._draw_goal(0, now[k])
+            *place, height = task.goal[0]
+            self.assertGreater(height, 0.5)
+            self.assertEqual(height, ground.height(*place, now))
+
+    def test_a_goal_is_larger_than_the_ball(self):
+        for id_ in (SOCCER, 'PD_Biped3D_Terrain_Soccer_Hard-v0'):
+            with self.assertRaisesRegex(ValueError, 'goal_reached is 0.2; .* radius of the ball'):
+                suite.make(id_, {'goal_reached': 0.2})
 
     @parameterized.parameters(('plan', 2, 27), ('frame', 3, 3))
     def test_thirty_pictures_a_second(self, interface, steps, count):

@@ -288,7 +288,7 @@ def sections(entries: dict[str, dict[str, Any]]) -> list[tuple[str, str, tuple[s
             'Footstep tracking',
             f'By `training/evaluate_footsteps.py`, episodes of {values(footsteps, "seconds")} s, seed {values(footsteps, "seed")}: landing error in m, mean and 90th '
             'percentile, and mean heading error in rad. *General*: the plans of the environment, with sharp turns; '
-            '*made from the root*: relative to the root, as in planning environments; *pushes*: forces on the '
+            '*made from the root*: anew at every footstep, from the stance foot and the heading of the root; *pushes*: forces on the '
             'torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
             ('condition', 'episodes', 'no fall', 'reward', 'landing', '90 %', 'heading'),
             footstep_rows(),

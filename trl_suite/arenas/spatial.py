@@ -200,10 +200,15 @@ class SpatialArena(composer.Arena):
         rule: str = 'far',
     ) -> np.ndarray:
         """Draws a goal for one simulation, clear of boxes at present; see `SpatialGround.goal`."""
+        ground = self.grounds[env_id]
+        assert ground is not None
+        return ground.goal(random, root, rule, self.mover_centres(env_id))
+
+    def mover_centres(self, env_id: int) -> np.ndarray | None:
+        """Returns the present centres of one simulation's moving boxes, (k, 2) m; None if there are none."""
         ground, centres = self.grounds[env_id], self.seen(env_id).centres(np.array([env_id]))[0]
         assert ground is not None
-        movers = ground.layout.movers and centres[: len(ground.layout.movers.speed)]
-        return ground.goal(random, root, rule, movers)
+        return ground.layout.movers and centres[: len(ground.layout.movers.speed)]
 
     def state(self, env_id: int) -> dict[str, Any]:
         """Returns the state from which `restore` restores the ground of one simulation exactly."""

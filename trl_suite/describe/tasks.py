@@ -167,7 +167,7 @@ def _plans(task: Any) -> list[str]:
             )
     if plans.from_root:
         lines.append(
-            f'with probability {plans.from_root:g} the plan is relative to position and heading of the root'
+            f'with probability {plans.from_root:g} the plan begins anew at the stance foot, with the heading of the root'
         )
     if plans.stop:
         low, high = plans.stay

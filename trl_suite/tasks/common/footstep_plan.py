@@ -153,7 +153,7 @@ def check_two_feet(spec: CharacterSpec) -> None:
 
 
 def straight_step(steps: FootstepLibrary, length: float) -> int:
-    """Returns the straight step of a library whose length is nearest to `length`, m."""
+    """Returns the straight step of a library that can follow itself; of several, the nearest to `length`, m."""
     straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
     return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
 

@@ -396,7 +396,16 @@ class GoalTask(BodyTask):
         return self.goals.place
 
     def _bind_goals(self, world: World, target_speed: float) -> GoalData:
-        """Allocates goals, and binds the ball."""
+        """Allocates goals, and binds the ball.
+
+        Raises:
+          ValueError: the centre of the ball is always farther from a goal, which is on the ground.
+        """
+        if self.ball and self.goal_reached <= BALL_RADIUS:
+            raise ValueError(
+                f'goal_reached is {self.goal_reached:g}; expected more than the radius of the ball, '
+                f'{BALL_RADIUS:g} m'
+            )
         n, ball, terms = world.n, self.ball, soccer_terms()
         self.goals = allocated(Goals, n, trace=np.zeros((TRACE_PLACES, 3)))
         self.saved = (*self.saved, self.goals)
@@ -459,7 +468,7 @@ class GoalTask(BodyTask):
             x, y = place + random_displacement(random, *distance)
             ground = self.arena.grounds[i]  # also beyond the window
             assert ground is not None
-            height = float(ground.height(x, y))
+            height = float(ground.height(x, y, self.arena.mover_centres(i)))
             goal = np.array([x, y, height if math.isfinite(height) else 0.0])
         self.goals.place[i] = goal
         lasts = random.uniform(*GOAL_LASTS)
@@ -471,5 +480,6 @@ class GoalTask(BodyTask):
         past = places[np.isfinite(places[:, 0])]
         there = flag(goal)
         if self.ball:
-            there = Marker('cylinder', goal, (self.goal_reached, 0.005, 0.0), GOAL_COLOUR)
+            radius = math.sqrt(self.goal_reached**2 - BALL_RADIUS**2)  # of the ball's centre, above
+            there = Marker('cylinder', goal, (radius, 0.005, 0.0), GOAL_COLOUR)
         return [*(Marker('sphere', place, size, TRACE_COLOUR) for place in past), there]

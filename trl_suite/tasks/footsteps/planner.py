@@ -66,8 +66,8 @@ class Plans(Config):
     )
     from_root: float = option(
         0.0,
-        'probability that a plan is relative to position and heading of the root, as the plans of a '
-        'high-level controller are',
+        'probability that a plan is drawn anew, from the stance foot and the heading of the root, with '
+        'which it does not depend on earlier plans, as those of a high-level controller do not',
         at_least=0,
         at_most=1,
     )
@@ -87,8 +87,8 @@ class Plans(Config):
     )
     stay: Range = option(
         Range(4, 40),
-        'number of footsteps of the clock for which it then stays, including the one that lands beside the '
-        'stance foot',
+        'number of plans, one for each footstep, with which it then stays: with the first the swing foot '
+        'lands beside the stance foot, and after the last the next foot first steps in place',
         **within(1, LONGEST_STAY, 'footsteps'),
     )
     react: float = option(

@@ -195,7 +195,8 @@ class Footsteps(PlanTask):
 class SpatialFootsteps(Footsteps):
     """A spatial biped tracks a plan of footsteps, with a library of single steps of this character.
 
-    Episodes start from the straight step whose length is nearest to the planned one.
+    Episodes start from the straight step that can follow itself; of several, the one whose length is
+    nearest to the planned one.
 
     With the option `mirrored`, observations and actions are reflected in left stance; the phase is
     then that of the single step, and the plan has only the landing places that are not 0.
