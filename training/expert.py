@@ -50,7 +50,7 @@ BEYOND = 1.5  # assumed cost per m outside the map
 
 Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-wrap = wrapped.function  # compiled, it takes no arrays
+wrap = wrapped.__wrapped__  # compiled, it takes no arrays
 
 
 class Map:

@@ -61,7 +61,7 @@ Act = Callable[[np.ndarray], np.ndarray]
 def falls(
     environments: VectorEnvironment, act: Act, back: int
 ) -> tuple[list[list[dict[str, Any]]], np.ndarray, float]:
-    """Runs each simulation until a fall that is preceded by `back` steps.
+    """Runs each simulation until a fall that is preceded by `back` steps; to be stuck is none.
 
     Returns:
       For each simulation the states before its last `back` steps, the last one first; the position
@@ -78,8 +78,9 @@ def falls(
             step = environments.step(act(observation), going)
             distance += float((position(environments) - before)[going].sum())
             steps += int(going.sum())
+            stuck = step.info.get('stuck')
             for i in np.flatnonzero(step.terminated & going).tolist():
-                if len(past[i]) == back:
+                if len(past[i]) == back and not (stuck is not None and stuck[i]):
                     going[i] = False
                     bar.update()
                 else:
@@ -135,7 +136,11 @@ def of_gait(
     rng, options = np.random.default_rng(seed), {'autoreset': 'disabled', 'step_limit': None}
     environments = VectorEnvironment(id_, number, 1, seed, **options)
     parameters = environments.task.gait.parameters
-    base = parameters.action(parameters.base_actions)
+    base = (
+        parameters.action(parameters.base_actions)
+        if policy.choices is None
+        else policy.choices.astype(float)
+    )
     past, places, pace = falls(environments, policy, BACK)
     margin = min(PASSED, PASSED_CYCLES * pace)
     ends = np.cumsum([1, len(base), tries, tries])  # of the copies of each kind

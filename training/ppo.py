@@ -578,6 +578,7 @@ def main() -> None:
     id_, seed, changes, folder, threads = runs.command_line(
         __doc__.splitlines()[0], 'control steps'
     )
+    runs.check_seeds('--seed', seed)
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         score, complete = point['normalized_return'], point['completion_rate']
         print(f'{point["samples"]:9} {score:.3f} of the maximum, {complete:.0%} complete')

@@ -74,8 +74,8 @@ def command_line(
 
 
 def check_seeds(option: str, *seeds: int) -> None:
-    """Refuses to train with the seed of published results, which draws the same starts and terrains."""
-    checked(option, list(seeds), list[int], at_least=0)
+    """Refuses to train with seeds of evaluations, which draw the same starts and terrains."""
+    checked(option, list(seeds), list[int], at_least=0, at_most=EVALUATION_SEED - 1)
     if TEST_SEED in seeds:
         raise ValueError(f'{option}: {TEST_SEED} is the seed of the tests; choose another')
 

@@ -46,10 +46,17 @@ def stored(id_: str, episodes: int) -> dict[str, Any] | None:
     return found if {name: found[name] for name in asked} == asked else None
 
 
-def replaced(id_: str) -> bool:
-    """Returns whether the policy that an environment shares is another one than that of its results."""
+def replaced(id_: str, of: str | None = None) -> bool:
+    """Returns whether a policy is another one than that of the results of an environment that shares it.
+
+    Args:
+      id_: the environment.
+      of: the environment of the policy; None: the one whose policy it shares.
+    """
     entry = runs.read(policies.SHARED).get(id_)
-    return entry is not None and entry.get('of') != digest(policies.reference(id_))
+    if entry is None or of not in (None, entry['policy']):
+        return False
+    return entry.get('of') != digest(policies.reference(id_))
 
 
 def preferring(
@@ -106,7 +113,7 @@ def main() -> None:
             flush=True,
         )
         low, high = before['distance_interval']
-        if found['distance'] <= (high if has_policy else low) and not replaced(id_):
+        if found['distance'] <= (high if has_policy else low) and not replaced(id_, of):
             continue
         entry = {
             'policy': of, **({'preference': preference} if preference else {}), 'evaluation': found,
