@@ -37,5 +37,6 @@ def flat(suite: unittest.TestSuite) -> Iterator[unittest.TestCase]:
 
 
 def is_slow(test: unittest.TestCase) -> bool:
-    marked = type(test), getattr(test, test._testMethodName)
+    module = sys.modules[type(test).__module__]
+    marked = module, type(test), getattr(test, test._testMethodName)
     return any(mark.name == 'slow' for each in marked for mark in getattr(each, 'pytestmark', ()))

@@ -39,10 +39,9 @@ def needs(module, extra):
         begin = tested.setUpClass
 
         def set_up_class(_):
-            try:
-                importlib.import_module(module)
-            except ImportError as error:
-                raise unittest.SkipTest(f"{error}: pip install 'trl_suite[{extra}]'") from None
+            if importlib.util.find_spec(module.partition('.')[0]) is None:
+                raise unittest.SkipTest(f"no {module}: pip install 'trl_suite[{extra}]'")
+            importlib.import_module(module)
             begin()
 
         tested.setUpClass = classmethod(set_up_class)
@@ -75,9 +74,18 @@ class GymnasiumTest(absltest.TestCase):
         # Random actions fell a walker within a second or so: 16 simulations of 256 steps.
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
 
+    def test_code_of_the_page_runs(self):
+        names = run_page('registers all ids')
+        self.assertEqual(names['observations'].shape, (16, 104))
+        self.assertEqual(names['rewards'].shape, (16,))
+
 
 @needs('stable_baselines3', 'sb3')
 class StableBaselinesTest(CommandTest):
+    def test_code_of_the_page_runs(self):
+        model = run_page('import SuiteVecEnv')['model']
+        self.assertEqual(model.num_timesteps, 2048)
+
     @pytest.mark.slow
     def test_example_runs(self):
         out = run_example('stable_baselines_ppo', '--samples', '40960', '--every', '4096')

@@ -485,7 +485,7 @@ REFUSED = (
     ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
     ({'substeps': 0}, 'substeps is 0'), ({'spawn': 'here'}, "'here'"),
     ({'start_noise': np.nan}, 'start_noise is nan'), ({'start_noise': 1e300}, 'from 0 to 1, in rad'),
-    ({'terrain_observation': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
+    ({'terrain_observation': 3}, 'unknown option'),
 )  # fmt: skip
 DO_NOT_FIT = (
     (('dog', 'torque'), {}, 'unknown actuation .*; known: gait'),

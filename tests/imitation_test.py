@@ -647,7 +647,7 @@ START_PHASES = (
 REFUSED = (
     *((id_, {'start_phase': value}, 'start_phase is') for id_ in (BIPED,) for value in START_PHASES),
     *((id_, options, message) for id_ in (BIPED, PLANE) for options, message in (
-        ({'substeps': 3}, 'substeps is 3'), ({'start_phase': 1.0}, 'start_phase is'),
+        ({'substeps': 3}, 'substeps is 3'),
         ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
         ({'action_scale': np.inf}, 'action_scale is inf'),
         ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),

@@ -114,7 +114,8 @@ class DiscoveryTest(absltest.TestCase):
         found = tests.flat(unittest.TestLoader().discover(str(CHECKOUT)))
         found = {test.id().partition(' ')[0].removeprefix('tests.'): test for test in found}
         self.assertIn('package_test.PinTest.test_constraints_fix_what_is_required', found)
-        self.assertNotIn('test_long_random_rollout', ' '.join(found))
+        for slow in ('test_long_random_rollout', 'cluster_test'):
+            self.assertNotIn(slow, ' '.join(found))
         result = unittest.TestResult()
         with mock.patch.dict(os.environ):
             os.environ.pop('PYTEST_CURRENT_TEST', None)
