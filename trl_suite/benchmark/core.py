@@ -50,7 +50,7 @@ def scales() -> dict[str, dict[str, Any]]:
 
 
 def ends(id: str) -> tuple[float, float]:
-    """Returns the scores that are 0, the better of random and default action, and 1, the shipped policy's.
+    """Returns the scores that are 0, the better of random and default action, and 1, a shipped policy's.
 
     Raises:
       ValueError: the environment is not in the core set.

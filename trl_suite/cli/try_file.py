@@ -33,11 +33,14 @@ def declare(commands: Any) -> None:
         '--root', metavar='BODY', help='root of the character, parent of all other links'
     )
     command.add_argument(
-        '--end-effectors', nargs='+', metavar='BODY', help='by default the last body of each limb'
+        '--end-effectors',
+        nargs='+',
+        metavar='BODY',
+        help='by default the ends of limbs below the centre of mass',
     )
     text = (
         'links that must not touch the ground; without names there are none; by default the first '
-        'that can touch it'
+        'link with limbs that can touch it'
     )
     command.add_argument('--fall-links', nargs='*', metavar='BODY', help=text)
     text = "whether the character is three-dimensional; by default derived from the root's joints"

@@ -38,7 +38,7 @@ class SensorConfig(Config):
     preset: str | None = option(None, 'preset that the other options change', choices=LEVELS)
     noise: Any = option(
         None,
-        'standard deviation of Gaussian noise in every step, in the units of the block; for `contact`, the '
+        'standard deviation of Gaussian noise in every step, in the units of the block; for contact, the '
         'probability that a flag is wrong; by default 0, or that of the preset',
     )
     bias: Any = option(
