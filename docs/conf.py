@@ -29,11 +29,13 @@ ROOT = DOCS.parent
 # Pages whose text lies outside docs/; the page in docs/ only links to it.
 ELSEWHERE = {
     'changelog': ROOT / 'CHANGELOG.md',
+    'clips': ROOT / 'mocap' / 'README.md',
     'contributing': ROOT / 'CONTRIBUTING.md',
     'index': ROOT / 'README.md',
     'notebooks': ROOT / 'colab' / 'README.md',
     'physics_rate': ROOT / 'benchmarks' / 'physics_rate.md',
     'policies': ROOT / 'trained' / 'README.md',
+    'training': ROOT / 'training' / 'README.md',
 }
 PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()}
 LINK = re.compile(r'(?<=\]\()(?![a-z]+:|#)([^)#\s]+)')

@@ -1,4 +1,7 @@
-"""A custom character from an MJCF or URDF file with an open-loop trot; without a file, a table."""
+"""A custom character from an MJCF or URDF file with an open-loop trot; without a file, a table.
+
+Needs `pip install 'trl_suite[video]'`.
+"""
 
 import argparse
 import pathlib

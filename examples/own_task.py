@@ -1,4 +1,7 @@
-"""A custom task: adds a reward term, an observation block and a failure to an existing task."""
+"""A custom task: adds a reward term, an observation block and a failure to an existing task.
+
+Needs `pip install 'trl_suite[gymnasium,video,policies]'`.
+"""
 
 import argparse
 import pathlib

@@ -1,4 +1,7 @@
-"""A custom terrain from a height image or a mesh, with a walker; without a file, a crater."""
+"""A custom terrain from a height image or a mesh, with a walker; without a file, a crater.
+
+Needs `pip install 'trl_suite[video,policies]'`.
+"""
 
 import argparse
 import pathlib

@@ -1,6 +1,6 @@
 """Trains a policy with RLlib's PPO: each runner is a process that steps many simulations.
 
-Runner i has the seed s + i, and so other terrain. Prints steps and mean returns, at most 256.
+Runner i has the seed s + i, and so other terrain. Needs `pip install 'trl_suite[rllib]'`.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Trains a policy with TorchRL's PPO on threads of simulations; prints mean returns, at most 256."""
+"""Trains a policy with TorchRL's PPO on threads. Needs `pip install 'trl_suite[torchrl]'`."""
 
 import argparse
 import math

@@ -133,7 +133,8 @@ class PublishedTest(parameterized.TestCase):
         """Runs the first cell in a folder; returns what it asks pip for."""
         asked = []
         code = sources(notebook, 'code')[0]
-        code = re.sub(r'%pip install --quiet (.*)', r'pip(packages)', code)
+        code = code.replace('%pip install --quiet {packages}', 'pip(packages)')
+        code = re.sub(r'%pip install .* dm-control==.*', 'pass', code)
         code = re.sub(r'!apt-get.*', 'pass', code)
         found = object() if installed else None
         with (
