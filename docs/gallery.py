@@ -56,7 +56,6 @@ TERRAIN_LENGTH = {False: 24.0, True: 60.0}  # m; planar, three-dimensional
 CLOSE_LENGTH = 12.0  # m; for ground with small features
 CLOSE = ('var3d_checkers', 'var3d_ramp', 'var3d_stairs')
 TERRAIN_DRAWS = 2
-FRAME = 1 / 30  # s between two frames
 # Frames that represent each family and the suite: id and time, s.
 FAMILIES = {
     'imitation': ('PD_Raptor2D_LLC_Imitate_Flat-v0', 2.0),
@@ -111,7 +110,7 @@ def moving_items() -> Iterator[Item]:
     """Yields the animated pictures of all environments."""
     for id in catalogue.BY_ID:
         draw = functools.partial(moving.moving_picture, id)
-        yield Item(moving_path(id), draw, _policy_digest(id))
+        yield Item(f'moving/{id}.webp', draw, _policy_digest(id))
 
 
 def _policy_digest(id: str) -> str:
@@ -120,11 +119,6 @@ def _policy_digest(id: str) -> str:
         return ''
     own, preference = _digest(f'{policies.trained_for(id)}.npz'), policies.preference_for(id)
     return f'{own} {preference:g}' if preference else own
-
-
-def moving_path(id: str) -> str:
-    """Returns the path in the folder of an environment's animated picture."""
-    return f'moving/{id}.webp'
 
 
 def character_path(name: str) -> str:
@@ -269,7 +263,7 @@ def film_strip(id: str) -> np.ndarray:
     """Renders `scene`, or until the episode ends, with the best policy: `acting.best`."""
     moments: list[int] = []
     _run(id, lambda environment: moments.append(0))  # counts frames until the episode ends
-    first = min(round(scene(id)[1] / FRAME), len(moments) - 1)
+    first = min(round(scene(id)[1] / moving.FRAME), len(moments) - 1)
     spread = rendering.spread(len(moments) - first, COLUMNS)
     images = _draw(id, {first + number for number in spread}, STRIP_SIZE)
     return rendering.film_strip(images, columns=COLUMNS)
@@ -282,11 +276,11 @@ def moment(id: str, time: float) -> np.ndarray:
       id: id of the environment.
       time: since the start of the episode, s.
     """
-    return _draw(id, {round(time / FRAME)}, STRIP_SIZE)[-1]
+    return _draw(id, {round(time / moving.FRAME)}, STRIP_SIZE)[-1]
 
 
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
-    """Renders the frames `wanted` of an episode, by number; they are FRAME apart."""
+    """Renders the frames `wanted` of an episode, by number; they are moving.FRAME apart."""
     camera = scene(id)[-1]
     images: list[np.ndarray] = []
     number = itertools.count()
@@ -313,7 +307,7 @@ def _run(id: str, look: Callable[[Environment], None]) -> None:
 
     time_step = environment.reset()
     seen()
-    while count * FRAME < seconds and not time_step.last():
+    while count * moving.FRAME < seconds and not time_step.last():
         with rendering.calling_each_frame(environment, seen):
             time_step = environment.step(policy(time_step))
     environment.close()

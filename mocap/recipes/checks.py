@@ -91,23 +91,30 @@ def contacts(low: np.ndarray) -> list[np.ndarray]:
     return [run for run in runs if low[run[0]]]
 
 
-def slide(box: np.ndarray, period_displacement: float, near: float = NEAR) -> float:
-    """Returns the longest travel of a corner in one contact, m.
+def slide(box: np.ndarray, displacement: np.ndarray | None) -> float:
+    """Returns the longest horizontal travel of a corner in one contact, m.
 
-    A corner's contact is the time it is lower than `near`: heel and toe have one each, so that
+    A corner's contact is the time it is lower than `NEAR`: heel and toe have one each, so that
     rolling from heel to toe is no slide.
 
     Args:
-      box: corners over one cycle, evenly sampled without the last frame, (n, 8, 3).
-      period_displacement: m, what a cycle adds to x.
-      near: m.
+      box: corners, evenly sampled, (n, 8, 3); of a cycle without the last frame.
+      displacement: x and y that a cycle adds, m; None: the motion does not repeat.
     """
     longest = 0.0
     for corner in range(8):
-        x, z = box[:, corner, 0], box[:, corner, 2]
-        for run in contacts(z < near):
-            path = x[run] + np.where(run < run[0], period_displacement, 0)
-            longest = max(longest, float(np.ptp(path)))
+        low = box[:, corner, 2] < NEAR
+        if displacement is None:
+            index = np.arange(len(low))
+            pieces = np.split(index, np.flatnonzero(np.diff(low)) + 1)
+            runs = [piece for piece in pieces if low[piece[0]]]
+        else:
+            runs = contacts(low)
+        for run in runs:
+            path = box[run, corner, :2]
+            if displacement is not None:
+                path = path + np.where(run < run[0], 1, 0)[:, None] * displacement
+            longest = max(longest, float(np.hypot(*np.ptp(path, axis=0))))
     return longest
 
 
@@ -140,7 +147,7 @@ def measure(clip: Clip, character: str, samples: int = SAMPLES) -> Report:
         seam_rate=float((seam / np.maximum(changes, 1e-9)).max()),
         margin=(margins[worst], worst),
         lowest=float(min(box[:, :, 2].min() for box in boxes.values())),
-        slide=max(slide(foot, clip.displacement[0]) for foot in feet),
+        slide=max(slide(foot, np.array([clip.displacement[0], 0.0])) for foot in feet),
         planted=float(planted.mean()),
         fastest=(float(rates.max()), clip.joints[int(rates.argmax())]),
     )

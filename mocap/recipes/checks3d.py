@@ -24,8 +24,8 @@ DEEP = 0.001  # m, self-contact that counts
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
-    """What was measured; lengths in m, angles in rad, times in s. As `checks.Report`, and:
+class Report(checks.Report):
+    """What was measured, as `checks.Report` has it, and:
 
     Attributes:
       heading_change: of the root from the first to the last frame.
@@ -36,15 +36,6 @@ class Report:
       angles: lowest and highest pitch, yaw and roll, or hinge angle, by joint.
     """
 
-    period: float
-    speed: float
-    seam_position: float
-    seam_rate: float
-    margin: tuple[float, str]
-    lowest: float
-    slide: float
-    planted: float
-    fastest: tuple[float, str]
     heading_change: float
     speeds: tuple[float, float]
     heights: tuple[float, float]
@@ -105,31 +96,6 @@ def sweep(model: mujoco.MjModel, clip: motion.Clip, poses: np.ndarray):
     return found, float(overlap)
 
 
-def slide(box: np.ndarray, displacement: np.ndarray | None, near: float = checks.NEAR) -> float:
-    """Returns the longest horizontal travel of a corner in one contact, m.
-
-    Args:
-      box: corners, evenly sampled, (n, 8, 3); of a cycle without the last frame.
-      displacement: x and y that a cycle adds, m; None: the motion does not repeat.
-      near: m; a corner lower than this is in contact.
-    """
-    longest = 0.0
-    for corner in range(8):
-        low = box[:, corner, 2] < near
-        if displacement is None:
-            index = np.arange(len(low))
-            pieces = np.split(index, np.flatnonzero(np.diff(low)) + 1)
-            runs = [piece for piece in pieces if low[piece[0]]]
-        else:
-            runs = checks.contacts(low)
-        for run in runs:
-            path = box[run, corner, :2]
-            if displacement is not None:
-                path = path + np.where(run < run[0], 1, 0)[:, None] * displacement
-            longest = max(longest, float(np.hypot(*np.ptp(path, axis=0))))
-    return longest
-
-
 def clearance(box: np.ndarray, loop: bool) -> float:
     """Returns the least height of a foot's lowest corner in the middle third of a swing, m."""
     low = box[:, :, 2].min(axis=1)
@@ -176,7 +142,9 @@ def measure(clip: motion.Clip, character: str, samples: int = checks.SAMPLES) ->
         seam_rate=seam_rate,
         margin=(margin[worst], worst),
         lowest=float(min(box[:, :, 2].min() for box in boxes.values())),
-        slide=max(slide(foot, clip.displacement[:2] if clip.loop else None) for foot in feet),
+        slide=max(
+            checks.slide(foot, clip.displacement[:2] if clip.loop else None) for foot in feet
+        ),
         planted=float(planted.mean()),
         fastest=(rates[fastest], fastest),
         heading_change=clip.heading_change,

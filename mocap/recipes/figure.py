@@ -28,14 +28,16 @@ def model(name: str, ground: bool = False) -> mujoco.MjModel:
         # The character's default class limits its joints; the root has no limits.
         root.add_joint(name=joint, type=kind, axis=axis, limited=mujoco.mjtLimited.mjLIMITED_FALSE)
     if ground:
-        spec.worldbody.add_geom(
-            name='ground',
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=(0, 0, 1),
-            friction=(0.81, 0.005, 0.0001),
-            rgba=(0.85, 0.85, 0.82, 1),
-        )
+        add_ground(spec)
     return spec.compile()
+
+
+def add_ground(spec: mujoco.MjSpec) -> None:
+    """Adds a plane with the friction of the suite's ground."""
+    spec.worldbody.add_geom(
+        name='ground', type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1),
+        friction=(0.81, 0.005, 0.0001), rgba=(0.85, 0.85, 0.82, 1), group=0,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
+from figure import add_ground
 
 from trl_suite import motion
 from trl_suite.motion import quaternion
@@ -125,13 +126,7 @@ def model(name: str, ground: bool = False) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(resources.directory('xml') / f'{name}.xml'))
     spec.body('root').add_freejoint(name='root')
     if ground:
-        spec.worldbody.add_geom(
-            name='ground',
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=(0, 0, 1),
-            friction=(0.81, 0.005, 0.0001),
-            rgba=(0.85, 0.85, 0.82, 1),
-        )
+        add_ground(spec)
     return spec.compile()
 
 

@@ -103,7 +103,8 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
 
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     character = environment.task.character
-    own = np.flatnonzero(model.body_rootid == _root(environment))
+    root = model.body_rootid[environment.task.body.links[0]]
+    own = np.flatnonzero(model.body_rootid == root)
     pairs, inside = _colliding(model, own), _contacts(model, data, own)
     touching = (model.geom_contype | model.geom_conaffinity) != 0
     solid = np.flatnonzero(np.isin(model.geom_bodyid, own) & touching)
@@ -137,12 +138,6 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
         *(program.printable(f'note: {_options(note)}') for note in spec.notes),
     ]
     return '\n'.join(lines)
-
-
-def _root(environment: Environment) -> int:
-    physics = environment.physics
-    body = physics.bind(environment.task.character.root_body).element_id
-    return int(physics.model.body_rootid[body])
 
 
 def _colliding(model: Any, bodies: np.ndarray) -> int:

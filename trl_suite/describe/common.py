@@ -17,11 +17,6 @@ from trl_suite.util.tables import Section, Table, section
 REWARD_WEIGHT = 'reward weight'  # title of a column of links
 
 
-def floats(values: Any) -> list[float]:
-    """Returns values as Python floats."""
-    return [float(value) for value in values]
-
-
 def character(environment: Environment, joints: tuple[str, Iterable[object]]) -> Iterator[Section]:
     """Yields sections on a task's character and its links; `joints` is a column of the table."""
     task: Any = environment.task
@@ -135,8 +130,8 @@ def actions(
     action_map: ActionMap, titles: Sequence[str], *columns: Iterable[object], unit: str = ''
 ) -> Section:
     """Returns the table of what each action does; `titles` of its name, and of further columns."""
-    offset = floats(np.round(action_map.action_offset, 9) + 0.0)
-    cells = zip(action_map.names, offset, floats(action_map.action_scale), *columns, strict=True)
+    offset = np.round(action_map.action_offset, 9) + 0.0
+    cells = zip(action_map.names, offset, action_map.action_scale, *columns, strict=True)
     first, *others = titles
     return section(
         f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '

@@ -11,7 +11,7 @@ import numpy as np
 from trl_suite import terrain
 from trl_suite.bodies.reference import CONTROL_TIMESTEP
 from trl_suite.describe import gait
-from trl_suite.describe.common import REWARD_WEIGHT, actions, floats, reward
+from trl_suite.describe.common import REWARD_WEIGHT, actions, reward
 from trl_suite.describe.options import table_of
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.build import task_type
@@ -51,7 +51,7 @@ def action(environment: Environment) -> Section:
     action_map = environment.action_map
     title, limits = _limits(environment)
     unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
-    return actions(action_map, ('controls', title), floats(limits), unit=unit)
+    return actions(action_map, ('controls', title), limits, unit=unit)
 
 
 def _limits(environment: Environment) -> tuple[str, Any]:
@@ -82,10 +82,10 @@ def time(spec: EnvSpec, task: Any) -> Section:
     )
 
 
-def span(values: tuple[float, float]) -> str:
-    """Returns a range of lengths in m."""
+def span(values: tuple[float, float], unit: str = 'm') -> str:
+    """Returns a range in words."""
     low, high = values
-    return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
+    return f'{low:g} {unit}' if low == high else f'{low:g} to {high:g} {unit}'
 
 
 def clip(task: Any) -> Section:
@@ -295,7 +295,7 @@ def _goal(spec: EnvSpec, task: Any, rule: str) -> Section:
     return section(
         'Goal',
         f'drawn {where}; redrawn when the walker is within {task.goal_reached:g} m of it, or after '
-        f'{_seconds(goals.GOAL_LASTS)}',
+        f'{span(goals.GOAL_LASTS, "s")}',
     )
 
 
@@ -305,17 +305,13 @@ def _goal_and_ball(away: tuple[float, float] | None = None) -> Section:
         'Goal and ball',
         f'a ball of radius {goals.BALL_RADIUS:g} m and {goals.BALL_MASS:g} kg is placed {span(goals.BALL_AWAY)} from the walker, '
         f'the goal {span(away or goals.GOAL_AWAY)} from the ball, in any direction; the ball is placed again '
-        f'after {_seconds(goals.BALL_LASTS)}, the goal is redrawn after {_seconds(goals.GOAL_LASTS)}',
+        f'after {span(goals.BALL_LASTS, "s")}, the goal is redrawn after {span(goals.GOAL_LASTS, "s")}',
     )
 
 
 def _layout(spec: EnvSpec) -> Layout:
     """Returns the layout of the ground of an environment's terrain."""
     return SpatialGround(terrain.load(spec.part('terrain')), 0).layout
-
-
-def _seconds(span: tuple[float, float]) -> str:
-    return f'{span[0]:g} to {span[1]:g} s'
 
 
 @dataclasses.dataclass(frozen=True)

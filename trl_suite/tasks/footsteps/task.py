@@ -7,7 +7,6 @@ van de Panne 2017).
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -172,13 +171,13 @@ class Footsteps(PlanTask):
             self._begin_plan(i)
         align_all(env_ids, self._first_tracks(env_ids), self._pack)
 
-    @abc.abstractmethod
     def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
-        """Returns the tracks of the reference at the start of episodes, (m,)."""
+        """Returns the tracks of the reference at the start of episodes, (m,); here one per stance."""
+        return self.plan.stance[env_ids]
 
-    @abc.abstractmethod
     def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
-        """Returns the tracks of the reference that are nearest to the plans, (m,)."""
+        """Returns the tracks of the reference that are nearest to the plans, (m,); here one per stance."""
+        return self.plan.stance[env_ids]
 
     # A step.
 
@@ -322,12 +321,6 @@ class PlanarFootsteps(Footsteps):
                 'clip.mirrored()'
             )
         return reference
-
-    def _first_tracks(self, env_ids: np.ndarray) -> np.ndarray:
-        return self.plan.stance[env_ids]
-
-    def _choose(self, env_ids: np.ndarray, measurement: Measurement) -> np.ndarray:
-        return self.plan.stance[env_ids]
 
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places."""
