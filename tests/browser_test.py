@@ -200,6 +200,28 @@ class SceneTest(parameterized.TestCase):
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
 
+    def test_colours_are_those_of_the_materials(self):
+        environment, scene = self.shown('PD_Raptor2D_Gaps_Terrain-v0')
+        scene.update()
+        model = environment.physics.model
+        bones = scene._handles['tube'].batched_colors
+        materials = model.geom_matid[model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE]
+        expected = 255 * model.mat_rgba[materials, :3] ** web_scene.GAMMA
+        np.testing.assert_allclose(np.unique(bones, axis=0), np.unique(expected, axis=0), atol=1.01)
+
+    @parameterized.parameters(DOG, SOCCER)
+    def test_contact_forces(self, id_):
+        environment, scene = self.shown(id_)
+        for _ in range(10):
+            environment.step(np.zeros(environment.action_spec().shape))
+            if environment.physics.data.ncon:
+                break
+        scene.option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = 1
+        scene.update()
+        self.assertGreaterEqual(
+            len(scene._handles['cone'].batched_positions), environment.physics.data.ncon
+        )
+
     @parameterized.parameters(DOG, HILLS, SOCCER, FOREST, RAMP)
     def test_squares_cover_the_ground(self, id_):
         environment = started(id_)
@@ -289,7 +311,7 @@ class OptionTest(absltest.TestCase):
         words = 'view', DOG, '--browser', '--port', '8765', '--option', option
         with mock.patch.object(browser, 'Browser') as made:
             self.assertEqual(cli.main(words), 0)
-        self.assertEqual(made.call_args.args[-1], {'randomize': {'friction': 0.3}})
+        self.assertEqual(made.call_args.kwargs['task_kwargs'], {'randomize': {'friction': 0.3}})
         viewer = browser.Browser(DOG, port=0, task_kwargs={'randomize': {'friction': 0.3}})
         self.addCleanup(viewer.stop)
         viewer.choose_environment('PD_Raptor2D_Flat-v0')
@@ -338,6 +360,8 @@ class BrowserTest(parameterized.TestCase):
             ValueError, "task_kwargs has 'random'; use the argument `seed`"
         ):
             browser.Browser(DOG, port=0, task_kwargs={'random': 5})
+        with self.assertRaisesRegex(ValueError, 'torque control cannot follow a clip'):
+            browser.Browser('imitation/torque_dog', 'clip', port=0)
 
     def test_start_and_stop(self):
         viewer = browser.Browser(DOG, 'zero', port=0)

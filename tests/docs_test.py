@@ -216,7 +216,7 @@ class GalleryTest(FolderTest):
         self.assertContainsSubset(('suite.webp', 'terrains/gaps.png', 'terrains/plane.jpg'), paths)
         sources = [item.path for item in items if item.source]
         self.assertLen(
-            sources, len(policies.available()) + len(trained) + len(gallery.FAMILIES)
+            sources, 1 + len(policies.available()) + len(trained) + len(gallery.FAMILIES)
         )  # film strips and curves
 
     def test_pictures(self):

@@ -25,10 +25,25 @@ def add_command(
         name,
         help=text,
         description=f'{text[0].upper()}{text[1:]}.',
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=_Help,
     )
     command.set_defaults(run=run)
     return command
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, except for None, which is none."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default is None else super()._get_help_string(action)
+
+
+def check_used(arguments: argparse.Namespace, name: str, *users: str) -> None:
+    """Raises a ValueError if an option, by its name in Python, is given without those that use it."""
+    given = (getattr(arguments, each) for each in users)
+    if getattr(arguments, name) and not any(given):
+        names = (f'--{each.replace("_", "-")}' for each in (name, *users))
+        raise ValueError(f'{next(names)} has no effect without {" or ".join(names)}')
 
 
 def add_id(command: argparse.ArgumentParser, **options: Any) -> None:

@@ -20,7 +20,7 @@ def declare(commands: Any) -> None:
     command.add_argument('file', metavar='FILE', type=pathlib.Path, help=text)
     command.add_argument('--character', required=True, help='name of a character')
     add_file(command, '--skeleton', 'the .asf file of an .amc file')
-    text = 'frames per second of an .amc file, which does not state them; by default 120'
+    text = 'frames per second of an .amc file; by default those that it states, or else 120'
     command.add_argument('--rate', type=float, help=text)
     text = 'unit of lengths in m, by default 0.01 of BVH and 0.0254 (an inch) of .amc files'
     command.add_argument('--unit', type=float, metavar='M', help=text)

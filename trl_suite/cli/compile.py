@@ -39,6 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     folder, begin = compiled.cache_folder(), time.perf_counter()
     if folder is None:
         raise RuntimeError('there is no folder in which compiled code can be kept')
+    if compiled.AS_PYTHON:
+        raise RuntimeError('NUMBA_DISABLE_JIT is set, so that nothing is compiled; unset it')
     for spec in (bar := tqdm.tqdm(specs, unit='environment', disable=None)):
         bar.set_description(spec.id)
         made: tuple[Environment | VectorEnvironment, ...] = (

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import importlib
 import os
 import sys
@@ -76,7 +75,9 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
         # Values of --option may have any type; without one, this is a defect.
         if isinstance(error, TypeError) and not getattr(arguments, 'options', None):
             raise
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        try:
+            sys.stdout and sys.stdout.flush()
+        except (OSError, ValueError):
             _drop_output()
         print(f'trl-suite: error: {program.in_one_line(error)}', file=sys.stderr)
         return 2

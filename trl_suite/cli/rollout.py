@@ -17,6 +17,7 @@ from trl_suite.cli.arguments import (
     add_id,
     add_options,
     add_policy,
+    check_used,
     options_of,
     positive,
     valid,
@@ -48,13 +49,12 @@ def declare(commands: Any) -> None:
     add_file(command, '--video', 'write a video, .mp4 or .gif', *rendering.VIDEO_SUFFIXES)
     add_file(command, '--html', 'write an interactive replay, .html', *rendering.REPLAY_SUFFIXES)
     add_file(command, '--strip', 'write a film strip, .png', *rendering.IMAGE_SUFFIXES)
-    command.add_argument('--columns', type=positive, default=8, help='pictures in the strip')
+    command.add_argument('--columns', type=positive, help='pictures in the strip, by default 8')
     add_file(command, '--trajectory', 'write all time steps, .npz', '.npz')
     command.add_argument('--ghost', action='store_true', help='show the reference clip as well')
-    command.add_argument(
-        '--size', type=_size, default='640x480', metavar='WxH', help='size of pictures in pixels'
-    )
-    command.add_argument('--camera', default='side', help='name of a camera')
+    text = 'size of pictures in pixels, by default 640x480'
+    command.add_argument('--size', type=_size, metavar='WxH', help=text)
+    command.add_argument('--camera', help='name of a camera, by default side')
 
 
 @valid
@@ -67,6 +67,12 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(arguments: argparse.Namespace) -> None:
     """Runs a policy, writes the requested files, and prints a line per episode and per file."""
+    check_used(arguments, 'columns', 'strip')
+    check_used(arguments, 'size', 'video', 'strip')
+    check_used(arguments, 'camera', 'video', 'strip')
+    check_used(arguments, 'ghost', 'video', 'html', 'strip')
+    columns, camera = arguments.columns or 8, arguments.camera or 'side'
+    width, height = arguments.size or (640, 480)
     suite = engine.load()
     import tqdm  # a dependency of dm_control
 
@@ -75,8 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
     options = options_of(arguments)
     environment = suite.make(arguments.id, {**options, 'random': arguments.seed})
     policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
-    width, height = arguments.size
-    in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
+    in_strip = set(rendering.spread(arguments.steps + 1, columns))
     pictures: list[np.ndarray] = []
     record = _Record(environment, arguments.trajectory is not None)
     with contextlib.ExitStack() as stack:
@@ -89,7 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
 
         def picture() -> np.ndarray:
-            return rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
+            return rendering.frame(environment, height, width, camera, arguments.ghost)
 
         def look(first: bool) -> None:
             if video:
@@ -111,7 +116,7 @@ def run(arguments: argparse.Namespace) -> None:
                     in_strip.discard(done)  # the next reset has the same number
                     pictures.append(picture())
     if arguments.strip is not None:
-        rendering.film_strip(pictures, arguments.strip, arguments.columns)
+        rendering.film_strip(pictures, arguments.strip, columns)
     if arguments.trajectory is not None:
         id_ = suite.find(arguments.id).id
         archive.write(arguments.trajectory, {**record.arrays(), 'seed': arguments.seed, 'id': id_})

@@ -217,10 +217,10 @@ def _report(arguments: argparse.Namespace) -> None:
     report = engine.load('trl_suite.benchmark.report')
     benchmark = engine.load('trl_suite.benchmark')
     if arguments.json is not None:
-        for entry in filter(pathlib.Path.is_dir, arguments.entries):
+        for entry in arguments.entries:
             if arguments.json.resolve().is_relative_to(entry.resolve()):
                 raise ValueError(
-                    f'--json is {arguments.json}, in a folder of results; expected another folder'
+                    f'--json is {arguments.json}, among the results; expected another file or folder'
                 )
     results = [result for _, result in _read(benchmark, arguments.entries)]
     found = report.report(results)

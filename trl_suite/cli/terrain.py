@@ -25,7 +25,7 @@ def declare(commands: Any) -> None:
     command.add_argument(
         'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
     )
-    command.add_argument('--draws', type=positive, default=3, help='number of grounds')
+    command.add_argument('--draws', type=positive, help='number of grounds in a plot, by default 3')
     command.add_argument(
         '--length', type=float, default=40.0, help='length of a profile, or side of a map, in m'
     )
@@ -35,7 +35,7 @@ def declare(commands: Any) -> None:
     )
     text = 'length of ramps in place of vertical faces, in m'
     command.add_argument('--face-length', type=float, help=text)
-    text = 'write a plot, .png, or a mesh of the first ground, .obj, .glb or .stl'
+    text = 'write a plot, .png, or a mesh of the first ground, .obj, .glb or .stl; by default terrain_NAME.png'
     add_file(command, '--output', text)
 
 
@@ -47,9 +47,13 @@ def run(arguments: argparse.Namespace) -> None:
     files.check_path(output, (*rendering.IMAGE_SUFFIXES, *terrain.WRITTEN))
     source = terrain.load(arguments.terrain).with_faces(arguments.face_length)
     if output.suffix.lower() in terrain.WRITTEN:
+        if arguments.draws:
+            raise ValueError(
+                f'--draws has no effect on a mesh, {output}, which has the first ground'
+            )
         _write_mesh(source, arguments, output)
         return
-    drawn = arguments.draws, arguments.length, arguments.seed, arguments.terrain_level
+    drawn = arguments.draws or 3, arguments.length, arguments.seed, arguments.terrain_level
     rendering.plot_terrain(source, output, *drawn)
     print(output)
 

@@ -49,7 +49,9 @@ def declare(commands: Any) -> None:
     command.add_argument('--turn', nargs=4, type=float, metavar=tuple('WXYZ'), help=text)
     text = 'replace moments of inertia that no body has by their mean'
     command.add_argument('--balance-inertia', action='store_true', help=text)
-    add_file(command, '--output', 'file of the picture on three terrains, .png')
+    add_file(
+        command, '--output', 'file of the picture on three terrains, .png; by default try_NAME.png'
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from trl_suite import rendering
 from trl_suite.cli import engine
-from trl_suite.cli.arguments import add_command, add_id, add_options, options_of, positive, valid
+from trl_suite.cli.arguments import (
+    add_command,
+    add_id,
+    add_options,
+    check_used,
+    options_of,
+    positive,
+    valid,
+)
 from trl_suite.environments import named_policies as acting
 
 if TYPE_CHECKING:
@@ -41,10 +49,10 @@ def declare(commands: Any) -> None:
     add_options(command)
     text = "show it in web browsers, with controls, instead of dm_control's viewer (F1: its keys)"
     command.add_argument('--browser', action='store_true', help=text)
-    command.add_argument('--host', default='127.0.0.1', help='address to listen on with --browser')
-    command.add_argument(
-        '--port', type=positive, default=8080, help='first port to try with --browser'
-    )
+    text = 'address to listen on with --browser, by default 127.0.0.1'
+    command.add_argument('--host', help=text)
+    text = 'first port to try with --browser, by default 8080'
+    command.add_argument('--port', type=positive, help=text)
 
 
 @valid
@@ -55,6 +63,8 @@ def _policy(text: str) -> str:
 def run(arguments: argparse.Namespace) -> None:
     """Opens a window and returns when it is closed, or serves web browsers until interrupted."""
     options = options_of(arguments)
+    check_used(arguments, 'host', 'browser')
+    check_used(arguments, 'port', 'browser')
     if arguments.browser:
         in_browser(arguments, options)
         return
@@ -76,9 +86,10 @@ def run(arguments: argparse.Namespace) -> None:
 def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
     """Serves web browsers until an interrupt."""
     shown = arguments.id, arguments.policy, arguments.seed
-    address = arguments.host, arguments.port
+    address = {name: getattr(arguments, name) for name in ('host', 'port')}
+    given = {name: value for name, value in address.items() if value is not None}
     kind = engine.load('trl_suite.viewing.browser').Browser
-    kind(*shown, *address, options, opened=_tell).run()
+    kind(*shown, **given, task_kwargs=options, opened=_tell).run()
 
 
 def _tell(viewer: Browser) -> None:

@@ -42,7 +42,8 @@ CAMERA = np.array([0.0, -4.0, 1.0])  # m; position of the camera from the charac
 FIELD_OF_VIEW = 0.8  # rad
 FRONT = 4  # number of a skybox's face
 
-_ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1)
+# The second and third: forces on one body, and between two.
+_ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1, mujoco.mjtGeom.mjGEOM_ARROW2)
 
 
 class WebScene:
@@ -60,7 +61,7 @@ class WebScene:
         model = self._model = environment.physics.model.ptr
         self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + ROOM)
         self._perturbation, self._camera = mujoco.MjvPerturb(), mujoco.MjvCamera()
-        self._colours = _material_colours(model)
+        self._colours = _texture_colours(model)
         self._is_ground = np.asarray(model.body_weldid[model.geom_bodyid] == 0)
         self._root = root_body(environment)
         arena = getattr(environment.task, 'arena', None)
@@ -112,10 +113,10 @@ class WebScene:
             elif 'samples' in self._handles:
                 self._handles['samples'].visible = False
 
-    def look_at_character(self, client: Any) -> None:
-        """Puts the camera of a client beside the character."""
+    def look_at_character(self, camera: Any) -> None:
+        """Puts the camera of a client, or that of further clients, beside the character."""
         middle = np.zeros(3) if self.follow else self._focus
-        client.camera.position, client.camera.look_at = middle + CAMERA, middle
+        camera.position, camera.look_at = middle + CAMERA, middle
 
     def _draw_shapes(self, offset: np.ndarray) -> None:
         batches: dict[str, list[tuple[Any, ...]]] = {}
@@ -189,7 +190,8 @@ class WebScene:
                 _assign(self._ground_handles[key], visible=True, **shape)
                 continue
             material, kind, number = key
-            colour = SHADES[number] * self._colours[material][:3]
+            own = self._model.mat_rgba[material, :3] if material >= 0 else 1.0
+            colour = SHADES[number] * own * self._colours[material]
             self._ground_handles[key] = self._add_mesh(
                 f'/ground_{material}_{kind}_{number}',
                 part,
@@ -232,7 +234,7 @@ def root_body(environment: Any) -> int:
 
 
 def _instances(
-    scene: Any, model: Any, material_colours: np.ndarray, is_ground: np.ndarray, lowest: float
+    scene: Any, model: Any, texture_colours: np.ndarray, is_ground: np.ndarray, lowest: float
 ) -> Iterator[tuple[Any, ...]]:
     """Yields shape, position, axes, scales and colour of the geoms in a scene.
 
@@ -247,7 +249,7 @@ def _instances(
             continue
         axes, size = geom.mat.copy(), geom.size.copy()
         if geom.matid >= 0:
-            colour *= material_colours[geom.matid]
+            colour[:3] *= texture_colours[geom.matid]
         if kind == kinds.mjGEOM_BOX:
             yield 'box', position, axes, size, colour
         elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
@@ -282,13 +284,15 @@ def _sky(model: Any) -> np.ndarray | None:
     return np.concatenate([column, np.repeat(column[-1:], size // 2, axis=0)])
 
 
-def _material_colours(model: Any) -> np.ndarray:
-    """Returns the mean colour of each material, (materials + 1, 4); the last is white, for none."""
-    colours = np.ones((model.nmat + 1, 4))
-    colours[:-1] = model.mat_rgba
+def _texture_colours(model: Any) -> np.ndarray:
+    """Returns the mean colour of each material's texture, (materials + 1, 3); the last is for none.
+
+    Geoms of a scene have the other colour of their material already.
+    """
+    colours = np.ones((model.nmat + 1, 3))
     textures = model.mat_texid[:, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
     for i in np.flatnonzero(textures >= 0):
-        colours[i, :3] *= _pixels(model, textures[i]).mean((0, 1)) / 255
+        colours[i] = _pixels(model, textures[i]).mean((0, 1)) / 255
     return colours
 
 

@@ -53,7 +53,7 @@ import numpy as np
 from trl_suite.util import files, interrupts
 
 UNUSED = 30 * 86400.0  # s; machine code of other source versions unused for longer is removed
-_AS_PYTHON = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
+AS_PYTHON = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
 
 
 class Compiled:
@@ -118,7 +118,7 @@ class Compiled:
 
 def compiled(function: Callable[..., Any], inline: bool = False) -> Any:
     """Decorates a function of one simulation, or a loop over simulations."""
-    if _AS_PYTHON:  # so that a debugger steps from function to function, in classes as well
+    if AS_PYTHON:  # so that a debugger steps from function to function, in classes as well
         return staticmethod(function)
     return Compiled(function, inline=inline)
 

@@ -229,8 +229,9 @@ class Browser:
         """Centres the view on the character, or leaves it to the users."""
         self._scene.follow = followed
         self._draw()
-        for client in self._server.get_clients().values():
-            self._scene.look_at_character(client)
+        clients = self._server.get_clients().values()
+        for camera in (self._server.initial_camera, *(client.camera for client in clients)):
+            self._scene.look_at_character(camera)
 
     @_request
     def choose_environment(self, spec: str | EnvSpec) -> None:
@@ -299,6 +300,7 @@ class Browser:
             policy = next(iter(choices))
         elif policy not in choices:
             choices[policy] = self._policy(policy, environment, spec)
+            choices[policy](environment.reset())  # raises here what its first action would
         return Loaded(spec, environment, choices, policy)
 
     def _policy(self, name: str, environment: Environment, spec: EnvSpec) -> Policy:
