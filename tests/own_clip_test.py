@@ -225,6 +225,7 @@ DAMAGED = (  # the last of these words in a file, what takes its place, the mess
     ('a.bvh', 'MOTION', 'MOTON', 'no line MOTION'), ('a.bvh', 'Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
     ('a.bvh', 'Frame Time: ', 'Frame Time: 1e-320 ', 'too large, or Frame Time is too small'),
     ('a.asf', 'begin\nid 2', 'id 2', "'id 2': expected 'begin' before it"),
+    ('a.asf', 'angle deg', 'angle grad', "'angle grad': expected 'deg' or 'rad'"),
     ('a.asf', 'length 0.45', 'length 0', "'length 0': expected a positive number"),
     ('a.asf', 'length 0.45', 'length nan', "'length nan': expected a positive number"),
     ('a.asf', 'direction 0 -1 0', 'direction 0 inf 0', 'expected three finite numbers'),
@@ -281,6 +282,37 @@ class ReadingTest(ClipTest):
         clip = retargeting.retarget(capture, PLAIN)
         self.assert_same_poses(clip, figure.poses, 1e-3)
         np.testing.assert_allclose(clip.times, np.arange(25) / 24)
+
+    def test_acclaim_motions_may_state_rate_and_unit(self):
+        _, asf, amc = self.capture()
+        plain, text = motion.read_amc(amc, asf), amc.read_text()
+        self.assertAlmostEqual(plain.times[1], 1 / 120)
+        amc.write_text(':SAMPLES-PER-SECOND 60\n:DEGREES\n' + text)
+        stated = motion.read_amc(amc, asf)
+        self.assertAlmostEqual(stated.times[1], 1 / 60)
+        self.assertAlmostEqual(motion.read_amc(amc, asf, rate=30).times[1], 1 / 30)
+        np.testing.assert_array_equal(stated.rotations, plain.rotations)
+        amc.write_text(text.replace(':DEGREES', ':RADIANS'))
+        self.assertGreater(np.abs(motion.read_amc(amc, asf).rotations - plain.rotations).max(), 0.1)
+
+    def test_what_is_too_large(self):
+        _, asf, amc = self.capture()
+        many = ''.join(f'begin\nname b{i}\nlength 1\ndirection 0 1 0\nend\n' for i in range(3000))
+        asf.write_text(asf.read_text().replace(':bonedata\n', f':bonedata\n{many}', 1))
+        bvh = self.folder / 'many.bvh'
+        bvh.write_text('HIERARCHY\nROOT a\n{\n' + 'JOINT b\n' * 3000)
+        flat = motion.Clip(
+            'flat', np.array([0, 1e-6, 2e-6, 1e3]), np.zeros((4, 3)), 'planar', (), ()
+        )
+        assert_refused(
+            self,
+            (lambda: motion.read_amc(amc, asf), 'line .*expected at most 2000 bones'),
+            (lambda: motion.read_bvh(bvh), 'line .*expected at most 2000 joints'),
+            (
+                lambda: retargeting.cycle(flat, 0, 1000),
+                'frames, 1e-06 s apart; expected at most 100000',
+            ),
+        )
 
     def test_another_heading_size_and_place(self):
         """Twice as large, turned to the left and set aside: the same clip in the end."""

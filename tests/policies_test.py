@@ -375,6 +375,7 @@ class ActTest(parameterized.TestCase):
         (make_convolving, {'line': 60_000, 'weights': [np.zeros((3000, 1, 4)), np.zeros((2, 4, 5))]},
          r'filter_0: its windows have 8.55e\+07 numbers in all; expected at most 1e\+06'),
         (make_seeing, {'grid': (7, 6)}, r'grid: \(7, 6\) does not divide 60 inputs'),
+        (make_seeing, {'grid': (2**40, 2**40)}, r'grid: \(\d+, \d+\) does not divide'),
         (make_seeing, {'grid': (60,)}, r'grid: \(60,\) does not divide'),
         (make_seeing, {'grid': (0, 6)}, r'grid: \(0, 6\) does not divide'),
         (make_seeing, {'grid': (5, 12)}, r'filter_0: has shape .*; expected \(2, 3, 1, 4\)'),

@@ -28,7 +28,8 @@ from trl_suite.util.options import checked
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
-ACCLAIM_RATE = 120.0  # frames per second of the CMU database; the files do not state the rate
+ACCLAIM_RATE = 120.0  # frames per second of the CMU database, whose files do not state the rate
+MOST_JOINTS = 2000
 MOST_ROTATIONS = 2e7  # of a motion; frames need not name all bones
 _AXES = {'x': (1.0, 0.0, 0.0), 'y': (0.0, 1.0, 0.0), 'z': (0.0, 0.0, 1.0)}
 
@@ -119,7 +120,7 @@ def read_bvh(
 def read_amc(
     path: str | os.PathLike[str],
     skeleton: str | os.PathLike[str],
-    rate: float = ACCLAIM_RATE,
+    rate: float | None = None,
     unit: float = ACCLAIM_UNIT,
     forward: str = 'z',
     up: str = 'y',
@@ -131,7 +132,7 @@ def read_amc(
     Args:
       path: the motion, an .amc file.
       skeleton: the .asf file that belongs to it.
-      rate: frames per second.
+      rate: frames per second; None: those that the file states, or 120.
       unit: unit of lengths in m, before multiplication by the file's factor.
       forward, up: as for `read_bvh`.
 
@@ -141,10 +142,11 @@ def read_amc(
     """
     path, skeleton = existing(path), existing(skeleton)
     axes = frame(forward, up)
-    checked('rate', rate, float, 'frames per second', above=0)
+    checked('rate', rate, float | None, 'frames per second', above=0)
     checked('unit', unit, float, 'm', above=0)
     bones, length, degrees = _skeleton(skeleton)
-    frames = _frames(path, bones)
+    frames, stated, in_degrees = _frames(path, bones)
+    rate = rate or stated or ACCLAIM_RATE
     if len(frames) * len(bones) > MOST_ROTATIONS:
         raise ValueError(
             f'{path}: {len(frames)} frames of {len(bones)} bones; expected no more than '
@@ -152,6 +154,7 @@ def read_amc(
         )
     times, names = np.arange(len(frames)) / rate, list(bones)
     radians = np.pi / 180 if degrees else 1.0
+    turned = radians if in_degrees is None else np.pi / 180 if in_degrees else 1.0
     offsets, local = np.zeros((len(bones), 3)), []
     for i, (name, bone) in enumerate(bones.items()):
         if bone['parent']:
@@ -160,7 +163,11 @@ def read_amc(
         angles = np.zeros((len(frames), 3))
         for column, dof in enumerate(bone['dof']):
             if dof.startswith('r'):
-                angles[:, bone['order'].index(dof[1])] = radians * values[:, column]
+                angles[:, bone['order'].index(dof[1])] = turned * values[:, column]
+            elif bone['parent'] and values[:, column].any():
+                raise ValueError(
+                    f'{path}: bone {name!r} moves along {dof!r}; expected rotations only, except of the root'
+                )
         rest = _euler(bone['order'], radians * bone['axis'][None], intrinsic=False)
         turn = _euler(bone['order'], angles, intrinsic=False)
         local.append(
@@ -234,11 +241,15 @@ def _capture(
 
 def _check_bvh(path: pathlib.Path, text: str) -> None:
     """Raises an error, with the line number, for input that pybvh rejects or reads wrongly."""
+    joints = 0
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         key = words[0].upper() if words else ''
         if key == 'MOTION':
             return
+        joints += key == 'JOINT'
+        if joints > MOST_JOINTS:
+            raise ValueError(f'{path}, line {number}: expected at most {MOST_JOINTS} joints')
         if key == 'OFFSET' and not _three_numbers(words[1:]):
             raise ValueError(
                 f'{path}, line {number}: {line.strip()!r}; expected OFFSET and three finite numbers'
@@ -278,7 +289,7 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
             elif section == 'units' and key == 'length':
                 length = _number(values, positive=True)
             elif section == 'units' and key == 'angle':
-                degrees = ''.join(values).lower().startswith('deg')
+                degrees = _in_degrees(''.join(values).lower())
             elif section == 'root' and key == 'order':
                 root['dof'] = _dofs(values)
                 if not {'tx', 'ty', 'tz'} <= {*root['dof']}:
@@ -302,6 +313,8 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
                     (bone['name'],) = values
                     if bone['name'] in bones:
                         raise ValueError('the name is taken')
+                    if len(bones) > MOST_JOINTS:
+                        raise ValueError(f'expected at most {MOST_JOINTS} bones')
                 elif key == 'length':
                     bone['length'] = _number(values)
                 elif key == 'direction':
@@ -324,6 +337,13 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
     if not root['dof'] or len(named) < 2:
         raise ValueError(f'{path}: expected the sections :root and :hierarchy')
     return {name: bones[name] for name in named}, length, degrees
+
+
+def _in_degrees(unit: str) -> bool:
+    """Returns whether a unit of angles is degrees, not radians."""
+    if unit[:3] not in ('deg', 'rad'):
+        raise ValueError("expected 'deg' or 'rad'")
+    return unit[:3] == 'deg'
 
 
 def _number(values: Sequence[str], positive: bool = False) -> float:
@@ -355,14 +375,27 @@ def _dofs(values: Sequence[str]) -> list[str]:
     return found
 
 
-def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[str, list[float]]]:
-    """Reads a .amc file: for every frame, the values of every bone."""
+def _frames(
+    path: pathlib.Path, bones: dict[str, dict[str, Any]]
+) -> tuple[list[dict[str, list[float]]], float | None, bool | None]:
+    """Reads a .amc file: for every frame, the values of every bone.
+
+    And, None if the file does not state them, its rate, and whether angles are degrees.
+    """
     frames: list[dict[str, list[float]]] = []
+    rate, degrees = None, None
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
-        if not words or words[0][0] in '#:':
+        if not words or words[0].startswith('#'):
             continue
         try:
+            if words[0].startswith(':'):
+                key = words[0][1:].lower()
+                if key == 'samples-per-second':
+                    rate = _number(words[1:], positive=True)
+                elif key in ('degrees', 'radians'):
+                    degrees = _in_degrees(key)
+                continue
             if len(words) == 1:
                 int(words[0])
                 frames.append({})
@@ -384,4 +417,4 @@ def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[s
     for i, found in enumerate(frames):
         if 'root' not in found:
             raise ValueError(f'{path}: frame {i} has no root')
-    return frames
+    return frames, rate, degrees

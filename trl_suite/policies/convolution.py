@@ -60,12 +60,12 @@ class Convolution:
         if self.grid is not None:
             positions = tuple(map(int, self.grid))
             put('grid', positions)
-            if len(positions) != 2 or min(positions) < 1 or self.line % np.prod(positions):
+            if len(positions) != 2 or min(positions) < 1 or self.line % math.prod(positions):
                 raise ValueError(
                     f'grid: {positions} does not divide {self.line} inputs into maps of rows and '
                     'columns'
                 )
-        channels, axes = self.line // int(np.prod(positions) or 1), len(positions)
+        channels, axes = self.line // (math.prod(positions) or 1), len(positions)
         weights, biases = [], []
         stack = checks.stack('filter_0', self.weights[0], axes + 2)
         for i, stride in enumerate(self.strides):
@@ -87,7 +87,7 @@ class Convolution:
             channels = filters
         put('weights', tuple(weights))
         put('biases', tuple(biases))
-        put('outputs', int(np.prod(positions)) * channels)
+        put('outputs', math.prod(positions) * channels)
 
     @functools.cached_property
     def members(self) -> tuple[Convolution, ...]:
@@ -113,7 +113,7 @@ class Convolution:
     def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Maps normalised inputs (n, c) to outputs and other inputs, (n, outputs + c - l)."""
         positions = self.grid or (self.line,)
-        maps = x[:, : self.line].reshape(len(x), -1, np.prod(positions)).swapaxes(1, 2)
+        maps = x[:, : self.line].reshape(len(x), -1, math.prod(positions)).swapaxes(1, 2)
         for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
             *window, _, filters = weight.shape
             places = _windows(positions, tuple(window), stride)

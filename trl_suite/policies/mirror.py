@@ -35,7 +35,7 @@ class Mirror:
         """Checks that the fields fit these numbers of observations and actions."""
         for kind, size in (('observation', observations), ('action', actions)):
             index, sign = getattr(self, f'{kind}_index'), getattr(self, f'{kind}_sign')
-            if not np.array_equal(np.sort(index), np.arange(size)):
+            if np.shape(index) != (size,) or (np.sort(index) != np.arange(size)).any():
                 raise ValueError(f'mirror_{kind}_index: expected each of 0 to {size - 1} once')
             if np.shape(sign) != (size,) or not np.isin(sign, (-1, 1)).all():
                 raise ValueError(f'mirror_{kind}_sign: expected {size} numbers, each 1 or -1')

@@ -9,6 +9,7 @@ import numpy as np
 from trl_suite.motion import Clip
 
 CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
+MOST_FRAMES = 100_000
 MOST = 300  # starts, and ends for each, that are compared at a time
 RATE_TIME = 0.1  # s; weight of a difference of velocities against one of poses
 
@@ -26,7 +27,8 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
       end: end of the cycle, s.
 
     Raises:
-      ValueError: a clip that loops or is too short, times that are not in it, or one without the other.
+      ValueError: a clip that loops or is too short, times that are not in it, or one without the other,
+        or a cycle of too many frames.
     """
     if clip.loop:
         raise ValueError(f'clip {clip.name!r} loops already; expected one that does not')
@@ -39,7 +41,11 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
             f'start and end are {start} and {end}; expected 0 <= start < end <= {clip.duration} s'
         )
     step = float(np.median(np.diff(clip.times)))
-    share = np.linspace(0, 1, max(3, round((end - start) / step) + 1))
+    if (frames := round((end - start) / step) + 1) > MOST_FRAMES:
+        raise ValueError(
+            f'clip {clip.name!r}: a cycle of {frames} frames, {step:g} s apart; expected at most {MOST_FRAMES}'
+        )
+    share = np.linspace(0, 1, max(3, frames))
     poses = clip.pose(start + share * (end - start))
     layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
     gap = _change(clip, poses[-1], poses[0])
