@@ -404,7 +404,7 @@ def terrain_index() -> str:
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Terrains',
-        'Terrain is random in every episode, except flat ground, ramps, checkers, paths and `cliff3d`. `trl-suite terrain NAME` plots random samples of a '
+        'Terrain is random in every episode, except flat ground, checkers, paths, `cliff3d`, and presets whose parameters leave nothing to draw. `trl-suite terrain NAME` plots random samples of a '
         'preset or of a parameter file. For terrain from a function, an image or a mesh see '
         '[Make your own](make_your_own.md).',
         *parts,

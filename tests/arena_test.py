@@ -28,6 +28,25 @@ DEVIATION = {
 OF_ROWS = sorted({spec.terrain for spec in catalogue.SPECS if 'planar' in spec.tags})
 
 
+class DepthTest(parameterized.TestCase):
+    @parameterized.parameters(('walls', 'WallH', 5.0), ('gaps', 'GapH', -6.0))
+    def test_faces_reach_the_ground_below(self, kind, name, height):
+        """Also those that are higher than boxes usually are thick."""
+        source = {'Type': f'var2d_{kind}', 'Params': [{f'{name}Min': height, f'{name}Max': height}]}
+        stage = Stage(source)
+        heights, vertical = stage.strip.window(0, 800)
+        faces = np.flatnonzero(vertical & (np.abs(np.diff(heights, prepend=0.0)) > 1))
+        self.assertNotEmpty(faces)
+        low, high = sorted((0.0, height))
+        for k in faces[:2].tolist():
+            x = (k - 0.5) * CELL
+            side = 1 if heights[k] > heights[k - 1] else -1  # the high ground is on this side
+            for z in np.linspace(low + 0.05, high - 0.05, 40):
+                distance, _, is_ground = stage.ray((x - 0.05 * side, 0, z), (side, 0, 0))
+                self.assertTrue(is_ground)
+                self.assertBetween(distance, 0.0, 0.11)
+
+
 class Stage:
     """An arena alone, or with one planar body on it."""
 

@@ -575,6 +575,13 @@ class ResetTest(parameterized.TestCase):
                     self.assertTrue(np.isfinite(step.observation['pose']).all())
             self.assertEqual(rough > 0, spawn == 'upstream')
 
+    def test_the_original_sees_further_if_it_observes_no_ground(self):
+        """Then its segments meet 3 m ahead, not 0.5 m behind."""
+        for id_, there in ((SLOPES, -0.5), ('PD_Biped2D_Incline-v0', 3.0)):
+            environment = made(id_, spawn='upstream', start_phase=0.0)
+            environment.reset()
+            self.assertAlmostEqual(environment.task._flat_part(0)['centre'], there)
+
     def test_terrain_level_selects_the_parameters(self):
         # Gaps of 0.1 to 0.25 m in the first set, of 0.5 to 1.5 m in the second.
         figures = ('biped2d', None, 'imitation'), ('dog', 'gait', 'gait')

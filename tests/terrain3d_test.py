@@ -664,6 +664,39 @@ class RegisterTest(parameterized.TestCase):
             assert_refused(self, (query, r'boxes\.\w+ has shape .*; expected \('))
 
 
+class LimitsTest(parameterized.TestCase):
+    def test_a_path_is_on_the_ground(self):
+        source = {'Type': 'var3d_path', 'Params': [{'PathHeight0': -1, 'PathHeight1': 0}]}
+        with self.assertRaisesRegex(
+            ValueError, 'PathHeight0 is -1; expected at least PathHeight1, 0'
+        ):
+            terrain.SpatialGround(terrain.load(source), 0)
+
+    def test_a_span_is_a_whole_number_of_cells(self):
+        seen = []
+
+        def level(x, y):
+            seen.append(x.min())
+            return 0 * x
+
+        ground = terrain.from_function(level, start_span=0.6)
+        for seed in range(60):
+            terrain.SpatialGround(ground, seed).height(0.0, 0.0)
+        self.assertAlmostEqual(np.ptp(seen), 1.2)
+
+    def test_numbers_of_boxes_may_be_random(self):
+        def some(parameters, random):
+            k = int(random.integers(1, 40))
+            return terrain.Layout(
+                level=0.0,
+                boxes=terrain.boxes(random.uniform(-12, 12, (k, 2)), [(0.2, 0.2)] * k, 0.3),
+            )
+
+        terrain.register3d('numbers', replace=True)(some)
+        found = terrain.capacity(terrain.load({'Type': 'numbers'})).boxes
+        self.assertGreater(found, 39)
+
+
 class SurroundingsTest(parameterized.TestCase):
     """Windows over a batch axis."""
 

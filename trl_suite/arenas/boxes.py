@@ -19,7 +19,9 @@ from trl_suite.util.compiled import compiled, compiled_inline
 PIECE = 4  # cells of the shortest tilted piece: 0.1 m
 DOUBLINGS = 3  # tilted pieces grow to at most PIECE * 2**DOUBLINGS cells: 0.8 m
 TOLERANCE = 0.004  # m; largest deviation of the profile from a piece that is doubled
-LEVEL_THICKNESS = 4.0  # m; level boxes form the sides of the deepest gaps (2.5 m)
+# m; level boxes form the sides of gaps, of which those of presets are up to 2.5 m deep. Beside deeper
+# ones they reach `BELOW` m below the floor.
+LEVEL_THICKNESS, BELOW = 4.0, 1.0
 TILTED_THICKNESS = 1.0  # m
 OVERLAP = 0.05  # m; by which tilted pieces are extended below each other at valleys
 LEAN = 0.9  # of the distance to the next face; limit of the overhang of a tilted box's lower end
@@ -222,13 +224,19 @@ def pose(pieces: Pieces, vertical: np.ndarray, angle: np.ndarray, end: float, bo
             left_face = max(left_face, x0)
         boxes.position[k, 1] = boxes.quaternion[k, 1] = boxes.quaternion[k, 3] = 0.0
         boxes.half_size[k, 1] = HALF_WIDTH
+        lowest = z0
+        if k > 0:
+            lowest = min(lowest, edges[3, k - 1])
+        if k < count - 1:
+            lowest = min(lowest, edges[1, k + 1])
+        thick = max(LEVEL_THICKNESS, z0 - lowest + BELOW)
         if level:
-            boxes.position[k, 0], boxes.position[k, 2] = 0.5 * (x0 + x1), z0 - 0.5 * LEVEL_THICKNESS
-            boxes.half_size[k, 0], boxes.half_size[k, 2] = 0.5 * (x1 - x0), 0.5 * LEVEL_THICKNESS
+            boxes.position[k, 0], boxes.position[k, 2] = 0.5 * (x0 + x1), z0 - 0.5 * thick
+            boxes.half_size[k, 0], boxes.half_size[k, 2] = 0.5 * (x1 - x0), 0.5 * thick
             boxes.quaternion[k, 0], boxes.quaternion[k, 2] = 1.0, 0.0
             continue
         slope, sine, cosine = edges[4, k], math.sin(angle[k]), math.cos(angle[k])
-        thickness = LEVEL_THICKNESS
+        thickness = thick
         if abs(slope) > EPSILON:
             # The lower end of a tilted box overhangs: to the right where the ground rises, else to
             # the left. It must not protrude from the next face on that side, nor beyond a ridge.

@@ -139,7 +139,7 @@ class PlanarArena(composer.Arena):
                 raise ValueError(
                     f'terrain {self.terrain.name!r} needs {pieces.number} boxes for '
                     f'{(BEHIND + AHEAD) * SPACING:g} m; expected at most {len(self.boxes)}, as '
-                    f'estimated from {PROBES} random windows; distribute its features more evenly'
+                    'estimated from a few windows; distribute its features more evenly'
                 )
             pieces = boxes.cut(start, *surface, tolerance, _kink(strip))
         end = (start + BEHIND + AHEAD) * SPACING
@@ -180,7 +180,9 @@ def _pool_size(terrain: Terrain) -> int:
     if generator is not None and generator.line is not None:
         windows = range(-LINE_PROBES, LINE_PROBES)  # every episode has the same ground
     most = 0
-    for terrain_level in range(max(1, len(terrain.parameter_sets))):
+    sets = max(1, len(terrain.parameter_sets))
+    # Between two sets there may be features that are merged in one of them, where they have no height.
+    for terrain_level in (*range(sets), *np.arange(sets - 1) + 0.01, *np.arange(sets - 1) + 0.5):
         for k in windows:
             strip, start = PlanarGround(terrain, abs(k), terrain_level=terrain_level), k * _WINDOW
             pieces = boxes.cut(start, *strip.window(start, _WINDOW), kink=_kink(strip))

@@ -94,7 +94,7 @@ _BIPED3D_SIMBICON_JOINTS = _sides(
 )
 
 _SPINE = ('spine0', 'spine1', 'spine2', 'spine3')
-_TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
+_TO_PARENT = ('targets of hips and shoulders are angles to the parent link, not to the world',)
 _BORROWED = ('the original has no muscles for this character; those of another character are used',)
 
 DOG = CharacterSpec(
@@ -165,6 +165,7 @@ BIPED2D_SIMBICON = CharacterSpec(
     torque_curves='human',
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
     differences={
+        'position': _TO_PARENT,
         'gait': (
             "action 0 is a retuned gait: with the original's gait the character falls here; "
             'torque is not rewarded',
@@ -192,6 +193,7 @@ HOPPER = CharacterSpec(
     stumble_exempt=('leg',),
     description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
     differences={
+        'position': _TO_PARENT,
         'gait': (
             '9 parameters, applied at touch-down; the original declares 8, applied in mid-air',
         ),
@@ -245,6 +247,7 @@ BIPED3D_SIMBICON = CharacterSpec(
     stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
     torque_curves='human',
     description='Biped of the gait state machines in 3D, 7 links: no waist, hips close to the middle.',
+    differences={'position': _TO_PARENT},
     spatial=True,
 )
 

@@ -189,8 +189,10 @@ class TrackingTask(BodyTask):
     def _flat_part(self, i: int) -> dict[str, Any]:
         spawn, centre = self.config.spawn, 0.0
         if spawn == 'upstream':
-            # The boundary of the original's segments: it builds them before it moves the root to 0.
-            centre = self.clip.pose(self.clock.start[i : i + 1] * self.period)[0, 0] - 0.5
+            # The boundary of the original's segments, in the middle of what it considers in view: it
+            # builds them before it moves the root to 0.
+            middle = -0.5 if self.config.terrain_observation else 3.0
+            centre = self.clip.pose(self.clock.start[i : i + 1] * self.period)[0, 0] + middle
         return {'spawn': spawn, 'centre': centre}
 
     def clip_action(self, env_id: int) -> np.ndarray:

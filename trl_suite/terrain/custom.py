@@ -147,7 +147,7 @@ def _register(name: str, function: Any, arguments: int, replace: bool = True) ->
     @register3d(name, START_SPAN, replace=replace)
     @functools.wraps(function, updated=())
     def layout(parameters: Parameters, rng: np.random.Generator) -> Layout:
-        most = int(parameters['StartSpan'] / GRID)
+        most = int(parameters['StartSpan'] / GRID + 1e-9)
         p, q = rng.integers(-most, most + 1, 2).tolist()
 
         def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:

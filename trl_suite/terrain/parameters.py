@@ -158,7 +158,8 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     known = ('Type', 'Params', *_UNUSED)
     check_known(f'key of {name}:', known, *content)
     if 'Type' not in content:
-        raise ValueError(f"{name}: key 'Type' is missing; known types: {', '.join(GENERATORS)}")
+        types = ', '.join((*GENERATORS, *GENERATORS3D))
+        raise ValueError(f"{name}: key 'Type' is missing; known types: {types}")
     checked(f'{name}: Type', content['Type'], str)
     sets = content.get('Params', ())
     if not isinstance(sets, (list, tuple)):

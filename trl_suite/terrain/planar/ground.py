@@ -88,8 +88,8 @@ class PlanarGround:
           spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start that the
             original has when run.
           centre: x where the first two stretches meet if spawn is 'upstream', m; otherwise unused.
-            In the original it is 3 for gait state machines, and x - 0.5 for the imitation of a clip
-            that has moved x m forward at its start phase.
+            In the original it is 3 for gait state machines, and for the imitation of a clip that has
+            moved x m forward at its start phase x - 0.5, or x + 3 without observation of the ground.
 
         Raises:
           ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or whose

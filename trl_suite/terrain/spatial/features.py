@@ -175,6 +175,11 @@ def path(parameters: Parameters, rng: np.random.Generator) -> Layout:
     length, shift = max(parameters['PathLength'], GRID), parameters['PathTurnLength']
     half = min(0.5 * parameters['PathWidth0'], 0.5 * length)
     height = parameters['PathHeight0']
+    if height < parameters['PathHeight1']:
+        raise ValueError(
+            f'PathHeight0 is {height:g}; expected at least PathHeight1, {parameters["PathHeight1"]:g} m: '
+            'the path is on the ground'
+        )
 
     def legs(low: np.ndarray, high: np.ndarray) -> Boxes:
         k = np.arange(

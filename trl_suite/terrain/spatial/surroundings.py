@@ -42,11 +42,12 @@ ALL = slice(None)
 
 def capacity(terrain: Terrain) -> Capacity:
     """Estimates the capacity that windows of a terrain need, from a few fixed seeds."""
-    found, counts, finite, strips = [], [], True, True
+    found, counts, totals, strips = [], [], set(), True
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for seed in range(PROBES):
             layout = SpatialGround(terrain, seed, terrain_level=terrain_level).layout
-            finite &= isinstance(layout.boxes, Boxes)
+            # Of boxes that are not a function there are no more than this, if it is always the same.
+            totals.add(len(layout.boxes.top) if isinstance(layout.boxes, Boxes) else -1)
             for centre in ((0.0, 0.0), (SHIFT * seed, -SHIFT * seed)):
                 low, high = np.array(centre) - HALF, np.array(centre) + HALF
                 boxes = layout.boxes_in(low, high)
@@ -57,7 +58,7 @@ def capacity(terrain: Terrain) -> Capacity:
                 counts.append(len(layout.boxes.top))
             found.append(_parts(layout))
     most, least = max(counts), min(counts)
-    if not finite and most:
+    if (len(totals) > 1 or totals == {-1}) and most:
         most = min(round(SPARE * most) + PROBES, most + 3 * (most - least) + 3)
     largest = Capacity(*(max(part) for part in zip(*found, strict=True)))
     return largest._replace(boxes=most, strips=strips)
@@ -119,7 +120,8 @@ class Surroundings:
         if any(part > most for part, most in zip(parts, capacity, strict=True)):
             raise ValueError(
                 f'a ground of type {ground.type!r} has more parts than {capacity}, the capacity estimated '
-                f'from {PROBES} samples; a generator must return the same kinds of parts in every episode'
+                f'from {PROBES} samples; a generator must return the same kinds of parts in every episode, '
+                'and as many belts and moving boxes'
             )
         arrays = self.arrays
         self.grounds[env_id] = ground
