@@ -122,11 +122,12 @@ def run(
 
 
 def row_of(found: dict[str, Any], seed: int, id_: str, policy: str) -> dict[str, Any]:
-    """Returns the results of a policy, by its digest; those of another one are removed."""
-    row = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {})
-    if row.get('of') != policy:
-        row.clear()
-        row['of'] = policy
+    """Returns the results of a policy, by its digest; those of others are removed, for all seeds."""
+    for rows in found['seeds'].values():
+        if rows.get(id_, {}).get('of', policy) != policy:
+            del rows[id_]
+    row: dict[str, Any] = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {})
+    row['of'] = policy
     return row
 
 
@@ -172,7 +173,8 @@ def _sees_ground(id_: str) -> bool:
 
 def table(found: dict[str, Any]) -> str:
     """Returns the results as Markdown: a table of each family with a row for each disturbance."""
-    ids = [id_ for id_ in IDS if any(id_ in rows for rows in found['seeds'].values())]
+    measured = {id_ for rows in found['seeds'].values() for id_ in rows}
+    ids = sorted(measured, key=lambda id_: IDS.index(id_) if id_ in IDS else len(IDS))
     limit, seeds = found['step_limit'], ', '.join(found['seeds'])
     length = (
         ''

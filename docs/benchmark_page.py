@@ -83,7 +83,8 @@ def entries() -> dict[str, Any]:
     each part, (runs, 20), by learner and environment.
 
     Raises:
-      ValueError: an invalid result, or one with other settings than those of the benchmark.
+      ValueError: an invalid result, or one with other settings than those of the benchmark; results of
+        several learners in a folder, or not one of each seed, of which baselines may lack some.
     """
     results: dict[str, list[dict[str, Any]]] = {}
     for folder in sorted(ENTRIES.iterdir()):
@@ -95,7 +96,10 @@ def entries() -> dict[str, Any]:
                 notes.append(f'budget is {result["budget"]}, not {BUDGET}')
             if notes:
                 raise ValueError(f'{path}: {"; ".join(notes)}')
-            results.setdefault(name, []).append({**result, 'learner': name})
+            results.setdefault(name, []).append(result)
+        _check_entry(folder, results.get(name, []))
+        for result in results.get(name, []):
+            result['learner'] = name
     ids = {name: {each['environment'] for each in of} for name, of in results.items()}
     asked = set.intersection(*(ids[f'{name} (baseline)'] for name in COMPARED))
     ranked: list[dict[str, Any]] = []
@@ -109,6 +113,21 @@ def entries() -> dict[str, Any]:
                 curve = [benchmark.normalised(id, score) for (score,) in each['scores']]
                 further.setdefault(name, {}).setdefault(id, []).append(curve)
     return {**report(ranked), 'further': further}
+
+
+def _check_entry(folder: pathlib.Path, results: list[dict[str, Any]]) -> None:
+    """Raises ValueError unless all results have one learner, and each environment has every seed once."""
+    if len(learners := {each['learner'] for each in results}) > 1:
+        raise ValueError(f'{folder}: several learners, {sorted(learners)}; expected one')
+    seeds: dict[str, list[int]] = {}
+    for each in results:
+        seeds.setdefault(each['environment'], []).append(each['seed'])
+    for id, found in seeds.items():
+        complete = folder.name in BASELINES or set(found) == set(benchmark.SEEDS)
+        if len(set(found)) < len(found) or not complete:
+            raise ValueError(
+                f'{folder}: {id} has the seeds {sorted(found)}; expected each of {benchmark.SEEDS} once'
+            )
 
 
 def every(found: dict[str, Any]) -> dict[str, dict[str, list[list[float]]]]:

@@ -10,7 +10,7 @@ from typing import Any
 import gallery
 import numpy as np
 
-from trl_suite.util import files
+from trl_suite import sequences
 from trl_suite.util.tables import markdown_table as table
 from trl_suite.util.tables import share
 
@@ -134,7 +134,7 @@ def plaid(kind: int) -> str:
         rows.append((learner, 'published', *published[kind].split()))
         for character in ('biped', 'dog', 'raptor') if name else ():
             paths = sorted((RUNS / f'plaid_{character}').glob(f'{name}_s*.json'))
-            scores = np.mean([files.read_json(path)['scores'] for path in paths], axis=0)
+            scores = np.mean([sequences.read(path)['scores'] for path in paths], axis=0)
             final, own = scores[-1], scores.diagonal()  # after all stages, after its own stage
             values = final / own - 1 if kind else final
             rows.append(('', f'our {character}', *map(figure, (*values, values.mean()))))

@@ -257,12 +257,27 @@ class PageTest(FolderTest):
         id_ = [*benchmark.CORE][i]
         return {**result_of('mine:Search', id_, 0, score), 'budget': 1_000_000, **changes}
 
+    def runs(self, numbers, score):
+        return [self.result(i, score, seed=seed) for i in numbers for seed in benchmark.SEEDS]
+
+    def test_entries_that_break_the_rules(self):
+        own = self.runs([0], 0.7)
+        for entry, message in (
+            (own[3:4], r'mine: .* has the seeds \[3\]; expected each of \(0, 1, 2, 3, 4\) once'),
+            ([*own, own[0]], r'has the seeds \[0, 0, 1, 2, 3, 4\]'),
+            ([{**own[0], 'learner': 'mine:Other'}, *own[1:]], 'mine: several learners'),
+        ):
+            with self.assertRaisesRegex(ValueError, message):
+                self.entries(PPO=[self.result(0, 0.2)], SuitePPO=[self.result(0, 0.4)], mine=entry)
+            shutil.rmtree(self.folder)
+            self.folder.mkdir()
+
     def test_who_is_ranked(self):
         """Learners with the environments of both baselines, in these, also if their class has one name."""
         program, found = self.entries(
             PPO=[self.result(0, 0.2), self.result(1, 0.3), self.result(3, 0.1)],
             SuitePPO=[self.result(0, 0.4), self.result(1, 0.5)], SAC=[self.result(0, 0.6)],
-            two=[self.result(i, 0.7) for i in range(3)], three=[self.result(2, 0.9)],
+            two=self.runs(range(3), 0.7), three=self.runs([2], 0.9),
         )  # fmt: skip
         ids, ranked = [*benchmark.CORE], ['PPO (baseline)', 'SuitePPO (baseline)', 'two']
         self.assertEqual(([*found['learners']], found['environments']), (ranked, ids[:2]))
@@ -272,7 +287,7 @@ class PageTest(FolderTest):
         self.assertAlmostEqual(found['further']['three'][ids[2]][0][-1], 0.9)
         text = program.leaderboard(found)
         self.assertIn('| SAC (baseline) | 1 | 0.600 |', text)
-        self.assertLess(text.index('| two | 1 |'), text.index('| SuitePPO (baseline) | 1 |'))
+        self.assertLess(text.index('| two | 5 |'), text.index('| SuitePPO (baseline) | 1 |'))
         best = [line.split(' | ')[-1] for line in program.core(found).splitlines()[2:7]]
         self.assertEqual(best, ['0.70 |', '0.70 |', '0.90 |', '0.10 |', '– |'])
 
@@ -324,7 +339,7 @@ class ReportCommandTest(CommandTest):
         with self.assertRaisesRegex(ValueError, 'scores: 0 stages; expected 20'):
             benchmark.BENCHMARK.read('nothing.json', complete=False)
         self.assert_refused(
-            'in a folder of results',
+            'among the results',
             'benchmark',
             'report',
             'Nothing',

@@ -103,7 +103,7 @@ def train_actions(action: str, seed: int, cycles: float, folder: pathlib.Path) -
 
 CHANGED = 'FSM_Dog2D_Terrain_Narrow_Gaps-v0'
 CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
-    'initial': ('before', {}),
+    'initial': ('before, in other episodes for each seed', {}),
     'selection': ('selection alone', {}),
     'all': ('the same change for all base actions', {'changes': 'all'}),
     'each': ('a change for each base action', {'changes': 'each'}),

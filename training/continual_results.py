@@ -48,6 +48,11 @@ def load(folder: pathlib.Path) -> Runs:
         if len(result['scores']) < 2:  # no metrics
             continue
         name = result['learner'].rpartition(':')[2]
+        others = {each['learner'] for each in found.get(name, {}).values()}
+        if others - {result['learner']}:
+            raise ValueError(
+                f'{path}: learner {result["learner"]!r}; other files have {others.pop()!r}, of the same name'
+            )
         if result['seed'] in found.setdefault(name, {}):
             raise ValueError(f'{path}: a second run of {name} with seed {result["seed"]}')
         found[name][result['seed']] = result

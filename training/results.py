@@ -84,7 +84,8 @@ def model_rows(entries: dict[str, dict[str, Any]]) -> Rows:
         scores = [run['evaluation']['normalized_return'] for run in every]
         complete = np.mean([run['evaluation']['completion_rate'] for run in every])
         row = [
-            f'{spec.character}, {MODELS[spec.actuation]}', str(len(every)), f'{np.mean(scores):.3f}',
+            f'{spec.character}, {MODELS[spec.actuation]}', str(len(every)),
+            million(every[0]['curve'][-1]['samples']), f'{np.mean(scores):.3f}',
             ' '.join(f'{score:.3f}' for score in scores), f'{complete:.0%}',
         ]  # fmt: skip
         for least in MILESTONES:
@@ -351,7 +352,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'Means over seeds, and the samples after which the policy first reaches 0.5, 0.8 and 0.9 of the maximum, '
         'averaged over the seeds that do (evaluated every 0.1 M samples).',
         table(
-            ('character, actuation', 'seeds', 'return', 'each', 'complete', 'to 0.5', 'to 0.8', 'to 0.9'),
+            ('character, actuation', 'seeds', 'samples', 'return', 'each', 'complete', 'to 0.5', 'to 0.8', 'to 0.9'),
             model_rows(entries),
         ),
     ]  # fmt: skip

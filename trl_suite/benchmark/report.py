@@ -177,8 +177,9 @@ def table(found: dict[str, Any]) -> str:
         for id in ids
     ]
     better = [
-        (pair, words(values, 2, any(several[learner] for learner in pair.split(', '))))
-        for pair, values in found['improvement'].items()
+        (pair, words(found['improvement'][pair], 2, several[a] or several[b]))
+        for a, b in itertools.combinations(learners, 2)
+        if (pair := f'{a}, {b}') in found['improvement']
     ]
     return '\n\n'.join((
         title,
