@@ -91,7 +91,7 @@ class Item:
 def items() -> Iterator[Item]:
     """Yields the still pictures of the gallery, and the animated picture of the suite."""
     draw = functools.partial(moving.side_by_side, SUITE, SUITE_SECONDS, SUITE_SIZE)
-    yield Item('suite.webp', draw, ' '.join(map(_policy_digest, SUITE)))
+    yield Item('suite.webp', draw, ' '.join(_policy_digest(id) for row in SUITE for id in row))
     for name, scene in FAMILIES.items():
         source = _policy_digest(scene[0]) + digest(LOOKS[name])
         yield Item(f'families/{name}.jpg', functools.partial(moment, *scene), source)

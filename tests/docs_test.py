@@ -215,6 +215,7 @@ class GalleryTest(FolderTest):
             self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
         self.assertContainsSubset(('suite.webp', 'terrains/gaps.png', 'terrains/plane.jpg'), paths)
         sources = [item.path for item in items if item.source]
+        self.assertLen(items[0].source.split(), 6)  # of the suite's picture
         self.assertLen(
             sources, 1 + len(policies.available()) + len(trained) + len(gallery.FAMILIES)
         )  # film strips and curves
