@@ -771,6 +771,8 @@ REFUSED = (
     (GENERAL, {'style': 'high_knee'}, "unknown style of 'biped3d_mocap' 'high_knee'; did you mean 'high_knees'"),
     (GENERAL, {'style': 'run'}, "unknown style of 'biped3d_mocap' 'run'"),  # of another character
     (GENERAL, {'style': 'mine.npz'}, "unknown style of 'biped3d_mocap' '.*mine.npz'"),
+    (GENERAL, {'grace_period': 1.0}, 'grace_period is 1; it has no effect without max_landing_error'),
+    (GENERAL, {'style': 'one_straight_leg', 'mirrored': True}, "mirrored: the steps 'biped3d_mocap_one_straight_leg'"),
     (FULL, {'style': 'in_place'}, "unknown style of 'biped3d_full_mocap' 'in_place'"),
     (GENERAL, {'footstep_scale': (1, np.inf)}, r'footstep_scale is \(1, inf'),
 )  # fmt: skip

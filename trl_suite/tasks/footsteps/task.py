@@ -115,6 +115,10 @@ class SpatialFootstepsConfig(MirroredConfig):
             replaced = {'force': None} if 'speed' in self.pushes else {}
             self._set('pushes', {**PUSHES, **replaced, **self.pushes})
         super().__post_init__()
+        if self.grace_period and self.max_landing_error is None:
+            raise ValueError(
+                f'grace_period is {self.grace_period:g}; it has no effect without max_landing_error'
+            )
         for name in ('mirrored', 'goal'):  # with a hidden plan there is always a goal
             if self.hidden_plan and getattr(self, name):
                 raise ValueError(
@@ -210,6 +214,13 @@ class SpatialFootsteps(Footsteps):
         if self.config.style is not None:
             self.motion = self.steps = styled(self.steps, self.config.style)
             self._first = straight_step(self.steps, self.length)
+        if self.steps.left_poses is not None:  # one side of the walk differs from the other
+            if self.mirrored:
+                raise ValueError(
+                    f'mirrored: the steps {self.steps.name!r} in left stance are not mirror images of those in '
+                    'right stance'
+                )
+            self.mirror = None
         pushes = self.config.pushes
         if pushes is not None:
             links = character.spec.links
