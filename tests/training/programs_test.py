@@ -713,7 +713,17 @@ class RecordsTest(absltest.TestCase):
         for table in ('stairs', 'ramps', 'oracles', 'foresight', 'shared'):
             for id_, found in runs.read(f'{table}.json').items():
                 named[table, id_] = found['of']
-        self.assertGreater(len(named), 170)
+        for key, found in runs.read('oracle_falls.json').items():
+            named['oracle_falls', key.partition(': ')[0]] = found['of']
+        for id_, found in runs.read('transfer.json').items():
+            flat = evaluate_references.flat_ground(catalogue.BY_ID[id_])
+            named[f'transfer: {id_}', flat] = found['of']
+        for table in ('footsteps', 'plans'):
+            for id_, found in runs.read(f'{table}.json').items():
+                for name, row in found.items():
+                    if table == 'footsteps' or name.startswith('reference'):
+                        named[f'{table}: {name}', id_] = row['of']
+        self.assertGreater(len(named), 280)
         for key, of in named.items():
             policy = policies.reference(key[1]) if isinstance(key, tuple) else policies.load(key)
             self.assertEqual(of, digest(policy), key)
