@@ -124,7 +124,7 @@ def run(
 def row_of(found: dict[str, Any], seed: int, id_: str, policy: str) -> dict[str, Any]:
     """Returns the results of a policy, by its digest; those of others are removed, for all seeds."""
     for rows in found['seeds'].values():
-        if rows.get(id_, {}).get('of', policy) != policy:
+        if id_ in rows and rows[id_].get('of') != policy:
             del rows[id_]
     row: dict[str, Any] = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {})
     row['of'] = policy
@@ -174,7 +174,7 @@ def _sees_ground(id_: str) -> bool:
 def table(found: dict[str, Any]) -> str:
     """Returns the results as Markdown: a table of each family with a row for each disturbance."""
     measured = {id_ for rows in found['seeds'].values() for id_ in rows}
-    ids = sorted(measured, key=lambda id_: IDS.index(id_) if id_ in IDS else len(IDS))
+    ids = sorted(measured, key=lambda id_: (IDS.index(id_) if id_ in IDS else len(IDS), id_))
     limit, seeds = found['step_limit'], ', '.join(found['seeds'])
     length = (
         ''

@@ -32,14 +32,14 @@ REALISTIC = [
 FLAT, GAPS = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0'
 
 
-def needs(module, extra):
-    """Skips a class of tests where the extra is not installed."""
+def needs(module, extra, only_there=''):
+    """Skips a class of tests where the extra, or a module that `only_there` is required, is not installed."""
 
     def decorated(tested):
         begin = tested.setUpClass
 
         def set_up_class(_):
-            if importlib.util.find_spec(module.partition('.')[0]) is None:
+            if importlib.util.find_spec(only_there or module.partition('.')[0]) is None:
                 raise unittest.SkipTest(f"no {module}: pip install 'trl_suite[{extra}]'")
             importlib.import_module(module)
             begin()
@@ -211,7 +211,7 @@ class ShimmyTest(parameterized.TestCase):
         self.assertEndsWith(out, 'picture of shape (240, 320, 3)\n')
 
 
-@needs('ray.rllib', 'rllib')
+@needs('ray.rllib', 'rllib', 'ormsgpack')
 class RLlibTest(absltest.TestCase):
     def test_configuration(self):
         for name, runners in (('rllib_ppo', 3), ('rllib_appo', 1)):  # in a batch

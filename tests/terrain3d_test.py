@@ -665,6 +665,10 @@ class RegisterTest(parameterized.TestCase):
 
 
 class LimitsTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        self.enterContext(mock.patch.dict(generators._spatial))
+
     def test_a_path_is_on_the_ground(self):
         source = {'Type': 'var3d_path', 'Params': [{'PathHeight0': -1, 'PathHeight1': 0}]}
         with self.assertRaisesRegex(

@@ -211,7 +211,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         seeds: Any = seed
         level = (options or {}).get('level')
-        if isinstance(seed, (list, tuple, np.ndarray)):
+        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim == 1):
             seeds = [*map(arguments.stream_seed, seed)]
             if None in seeds:
                 known = np.array([each is not None for each in seeds])

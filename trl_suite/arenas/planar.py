@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -183,8 +184,12 @@ def _pool_size(terrain: Terrain) -> int:
     sets = max(1, len(terrain.parameter_sets))
     # Between two sets there may be features that are merged in one of them, where they have no height.
     for terrain_level in (*range(sets), *np.arange(sets - 1) + 0.01, *np.arange(sets - 1) + 0.5):
-        for k in windows:
-            strip, start = PlanarGround(terrain, abs(k), terrain_level=terrain_level), k * _WINDOW
-            pieces = boxes.cut(start, *strip.window(start, _WINDOW), kink=_kink(strip))
-            most = max(most, pieces.number)
+        # A generator may refuse parameters between those of two sets.
+        allowed = contextlib.suppress(ValueError) if terrain_level % 1 else contextlib.nullcontext()
+        with allowed:
+            for k in windows:
+                strip = PlanarGround(terrain, abs(k), terrain_level=terrain_level)
+                start = k * _WINDOW
+                pieces = boxes.cut(start, *strip.window(start, _WINDOW), kink=_kink(strip))
+                most = max(most, pieces.number)
     return round(SPARE * most) + PROBES
