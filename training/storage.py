@@ -16,6 +16,7 @@ import uuid
 from collections.abc import Iterator
 
 import fsspec
+import runs
 
 CHECKPOINT = 'checkpoint.pt'
 EVERY = 5.0  # s; interval at which a new checkpoint is looked for
@@ -65,10 +66,17 @@ def put(folder: pathlib.Path, url: str) -> None:
 
 
 def remove(url: str) -> None:
-    """Removes the files of a run; there may be none."""
+    """Removes the files of a run; there may be none.
+
+    Raises:
+      FileExistsError: there are files, but none that a run writes.
+    """
     system, path = fsspec.core.url_to_fs(url)
-    if system.exists(path):
-        system.rm(path, recursive=True)
+    if not system.exists(path):
+        return
+    if system.find(path) and not any(system.exists(f'{path}/{name}') for name in runs.WRITTEN):
+        raise FileExistsError(f'{url}: is not the folder of a run; remove it, or choose another')
+    system.rm(path, recursive=True)
 
 
 @contextlib.contextmanager

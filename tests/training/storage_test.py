@@ -51,6 +51,11 @@ class StorageTest(FolderTest):
         storage.remove(url)
         self.assertEqual(self.fetched(url), {})
         storage.remove(url)
+        system.makedirs(path, exist_ok=True)
+        system.pipe_file(f'{path}/thesis.tex', b'')
+        with self.assertRaisesRegex(FileExistsError, 'is not the folder of a run'):
+            storage.remove(url)
+        self.assertLen(system.find(path), 1)
 
     def test_the_checkpoint_comes_last(self):
         """A machine that is lost between two files leaves what the old checkpoint needs."""
