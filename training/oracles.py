@@ -136,11 +136,9 @@ def of_gait(
     rng, options = np.random.default_rng(seed), {'autoreset': 'disabled', 'step_limit': None}
     environments = VectorEnvironment(id_, number, 1, seed, **options)
     parameters = environments.task.gait.parameters
-    base = (
-        parameters.action(parameters.base_actions)
-        if policy.choices is None
-        else policy.choices.astype(float)
-    )
+    base = getattr(policy, 'choices', None)
+    if base is None:
+        base = parameters.action(parameters.base_actions)
     past, places, pace = falls(environments, policy, BACK)
     margin = min(PASSED, PASSED_CYCLES * pace)
     ends = np.cumsum([1, len(base), tries, tries])  # of the copies of each kind
