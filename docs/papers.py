@@ -40,7 +40,7 @@ GAITS = (
     'Dog2D_Terrain_Mixed', 'Dog2D_Terrain_Slopes_Mixed', 'Dog2D_Terrain_Narrow_Gaps',
     'Dog2D_Terrain_Tight_Gaps', 'Raptor2D_Terrain_Mixed', 'Raptor2D_Terrain_Slopes_Mixed',
     'Raptor2D_Terrain_Narrow_Gaps', 'Goat2D_Terrain_Variable_Steps', 'Goat2D_Terrain_Cliffs',
-    'Hopper2D_Terrain_Mixed', 'Hopper2D_Terrain_Gaps', 'Biped2D_Terrain_Mixed', 'Dog2D_Terrain_Stairs_Rugged',
+    'Hopper2D_Terrain_Mixed', 'Hopper2D_Terrain_Gaps', 'Biped2D_Terrain_Mixed', 'Biped2D_Terrain_Gaps', 'Dog2D_Terrain_Stairs_Rugged',
 )  # fmt: skip
 CONDITIONS = (
     'straight', 'straight, 0.3 m', 'straight, 0.7 m', 'general', 'made from the root',

@@ -558,6 +558,16 @@ DIRECT = {
     'map_bound': 0.3, 'places': ('goal',), 'initial_std': 0.08, 'gamma': 0.97, 'start_count': 1e6,
     'value_goes_on': True, 'learning_rate': 2e-4, 'evaluate_every': 2e5,
 }  # fmt: skip
+# More noise makes the biped fall after a few cycles, whose parameters are 28.
+MORE_CYCLES: dict[str, Any] = {
+    'samples': 1.8e6, 'num_envs': 128, 'learning_rate': 2e-4, 'initial_std': 0.07, 'start_std': 0.07,
+    'start_count': 1e5,
+}  # fmt: skip
+# Distances rise when the updates become smaller.
+SMALLER_CHANGES = {
+    **MORE_CYCLES, 'samples': 1.6e6, 'learning_rate': 1.2e-4, 'last_learning_rate': 2e-5,
+    'kl_per_action': 0.002, 'initial_std': 0.06, 'start_std': 0.06,
+}  # fmt: skip
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 
 
@@ -666,10 +676,12 @@ OVERRIDES: tuple[Row, ...] = (
     ('PD_Biped3D_HLC_PathFollowing-v0', ON_A_TRAIL),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', {'samples': 1e6, 'least_share': {}, 'evaluation_episodes': 16}),  # a step is a cycle
+    ('FSM_Biped2D_Terrain_Gaps-v0',
+     {'initial_std': 0.08, 'evaluation_episodes': 8, 'further': (MORE_CYCLES, SMALLER_CHANGES)}),
 )  # fmt: skip
 
 # Gaits whose policy sets all parameters; of the others it selects a base action, see `learn_gaits.py`.
-EVERY_PARAMETER = ('FSM_Hopper2D_Terrain_Gaps-v0',)
+EVERY_PARAMETER = 'FSM_Hopper2D_Terrain_Gaps-v0', 'FSM_Biped2D_Terrain_Gaps-v0'
 
 # Policies for worlds and sensors that vary, in `trained/randomized`: `train_randomized.py` continues
 # the training of shipped ones with this preset of `randomize` and `sensors`. Low learning rates, to

@@ -823,6 +823,7 @@ class TrimTest(FolderTest):
         for id_, program in (
             ('PD_Biped2D_Flat-v0', 'ppo'),
             ('FSM_Hopper2D_Terrain_Gaps-v0', 'ppo'),
+            ('FSM_Biped2D_Terrain_Gaps-v0', 'ppo'),
             ('FSM_Raptor2D_Terrain_Slopes_Mixed-v0', 'learn_gaits'),
             ('FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'refine_gaits'),
         ):
