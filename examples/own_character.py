@@ -1,7 +1,4 @@
-"""A custom character from an MJCF or URDF file with an open-loop trot; without a file, a table.
-
-Needs `pip install 'trl_suite[video]'`.
-"""
+"""A custom character from a file, with an open-loop trot. Needs `pip install 'trl_suite[video]'`."""
 
 import argparse
 import pathlib

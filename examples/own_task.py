@@ -1,7 +1,4 @@
-"""A custom task: adds a reward term, an observation block and a failure to an existing task.
-
-Needs `pip install 'trl_suite[gymnasium,video,policies]'`.
-"""
+"""A reward term, a block and a failure. Needs `trl_suite[gymnasium,video,policies]`."""
 
 import argparse
 import pathlib

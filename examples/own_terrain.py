@@ -1,7 +1,4 @@
-"""A custom terrain from a height image or a mesh, with a walker; without a file, a crater.
-
-Needs `pip install 'trl_suite[video,policies]'`.
-"""
+"""A terrain from a height image or a mesh. Needs `pip install 'trl_suite[video,policies]'`."""
 
 import argparse
 import pathlib
