@@ -229,9 +229,10 @@ class VectorEnvironment:
             raise RuntimeError(
                 f'simulation {resetting[0]} has ended; reset it, or choose another autoreset'
             )
-        resting = np.ones(self.num_envs, bool)
-        resting[stepped] = False
-        if len(stepped) < self.num_envs:
+        some_rest = len(stepped) < self.num_envs
+        if some_rest:
+            resting = np.ones(self.num_envs, bool)
+            resting[stepped] = False
             action = np.where(resting[:, None], 0.0, action)
         self.action_map.check_finite(action)
 
@@ -249,7 +250,7 @@ class VectorEnvironment:
         self.at_limit = np.zeros(self.num_envs, bool)
         self.at_limit[stepped] = core.count(stepped, self.step_limit, self.time_limit)
         reward, terminated, info = task.seen.reward.copy(), task.seen.failed.copy(), task.info()
-        if len(stepped) < self.num_envs:
+        if some_rest:
             for each in (reward, terminated, *info.get('reward_terms', {}).values()):
                 each[resting] = 0
         truncated = self.at_limit & ~terminated
