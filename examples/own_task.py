@@ -1,4 +1,4 @@
-"""A reward term, a block and a failure. Needs `trl_suite[gymnasium,video,policies]`."""
+"""Adds a reward term, a block and a failure to a task. Needs `trl_suite[gymnasium,video,policies]`."""
 
 import argparse
 import pathlib

@@ -1,4 +1,4 @@
-"""A terrain from a height image or a mesh. Needs `pip install 'trl_suite[video,policies]'`."""
+"""A terrain from an image or a mesh, with a walker. Needs `pip install 'trl_suite[video,policies]'`."""
 
 import argparse
 import pathlib

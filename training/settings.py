@@ -563,7 +563,7 @@ MORE_CYCLES: dict[str, Any] = {
     'samples': 1.8e6, 'num_envs': 128, 'learning_rate': 2e-4, 'initial_std': 0.07, 'start_std': 0.07,
     'start_count': 1e5,
 }  # fmt: skip
-# Distances rise when the updates become smaller.
+# Distances rose while the updates became smaller.
 SMALLER_CHANGES = {
     **MORE_CYCLES, 'samples': 1.6e6, 'learning_rate': 1.2e-4, 'last_learning_rate': 2e-5,
     'kl_per_action': 0.002, 'initial_std': 0.06, 'start_std': 0.06,

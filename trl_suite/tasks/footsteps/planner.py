@@ -66,8 +66,8 @@ class Plans(Config):
     )
     from_root: float = option(
         0.0,
-        'probability that a plan is drawn anew, from the stance foot and the heading of the root, with '
-        'which it does not depend on earlier plans, as those of a high-level controller do not',
+        'probability that a plan is drawn anew, from the stance foot and with the heading of the root, '
+        'independent of earlier plans, as those of a high-level controller are',
         at_least=0,
         at_most=1,
     )
