@@ -333,11 +333,12 @@ class SiteTest(absltest.TestCase):
         return source[0]
 
     def test_pages_from_outside_the_folder(self):
+        written = set(conf.SUBJECTS.values())  # by the build of the site
         for name, path in conf.ELSEWHERE.items():
             text = self.page(name)
             self.assertStartsWith(text, path.read_text(encoding='utf-8').partition('\n')[0] + '\n')
             for link in _LINK.findall(text):
-                self.assertTrue((DOCS / link).exists(), f'{name}: {link}')
+                self.assertTrue(link in written or (DOCS / link).exists(), f'{name}: {link}')
         self.assertEqual(
             self.page('guide', '[a](../CONTRIBUTING.md#layers) [b](../training/ppo.py) [c](#d)'),
             '[a](contributing.md#layers) [b](../training/ppo.py) [c](#d)',
