@@ -50,7 +50,7 @@ TEACHERS: dict[str, Callable[..., Any]] = {
 USED = {'nominal': (CONTROLLER,), 'joint_expert': (CONTROLLER, DRIBBLING)}  # policies of teachers
 _STATE = (  # what a checkpoint holds besides what `learnt` returns
     'begun', 'samples', 'current', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns',
-    'steps',
+    'steps', 'reached', 'lengths',
 )  # fmt: skip
 
 
@@ -89,7 +89,10 @@ class Trainer:
         self.spec = spec_of(environment)
         self.seed, self.settings, self.threads, s = seed, settings, threads, settings
         _check(s)
-        self.samples = 0
+        self.samples, self.reached = 0, min(1, len(s.stages))
+        self.lengths = np.zeros(
+            2
+        )  # steps and number of episodes that ended since the last `advance`
         self.begin_stage(self.stage)
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
@@ -138,7 +141,17 @@ class Trainer:
     def stage(self) -> int:
         """Number of curriculum stages that have begun."""
         s = self.settings
+        if s.stage_length:
+            return self.reached
         return sum(self.samples >= share * s.samples for share, _ in s.stages)
+
+    def advance(self) -> None:
+        """Reaches the next curriculum stage if the last `num_envs` episodes were long enough."""
+        steps, number = self.lengths.tolist()
+        if number >= self.settings.num_envs:
+            if steps >= number * self.settings.stage_length:
+                self.reached = min(self.reached + 1, len(self.settings.stages))
+            self.lengths[:] = 0
 
     def begin_stage(self, number: int) -> None:
         """Makes and resets the simulations of a curriculum stage."""
@@ -241,6 +254,7 @@ class Trainer:
                     share[ended[t]] = 1.0
         observations[-1] = self.seen(self.observation)[0]
         self.samples += s.horizon * n
+        self.advance()
 
         flat = observations.reshape(-1, observations.shape[-1])
         inputs = self.scales(flat)
@@ -274,6 +288,7 @@ class Trainer:
         self.returns += reward
         self.steps += 1
         self.recent += self.returns[ended].sum(), self.steps[ended].sum(), ended.sum()
+        self.lengths += self.steps[ended].sum(), ended.sum()
         self.returns[ended] = self.steps[ended] = 0
 
     # Learning.

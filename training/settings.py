@@ -73,6 +73,9 @@ class Settings:
     # including `terrain`; or a tuple of options, with which as many simulations each run at the
     # same time. Evaluations use the options of the environment, or `evaluated_with`.
     stages: tuple[tuple[float, Any], ...] = ()
+    # Mean length of episodes, in control steps, with which the next stage begins; 0: it begins at its
+    # share of the samples.
+    stage_length: float = 0.0
     # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with
     # its weights, scales and noise; the weights of inputs that it does not have are 0. Or from one
     # of `ppo.TEACHERS`, which is imitated for `cloned` control steps.

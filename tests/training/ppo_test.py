@@ -178,6 +178,17 @@ def grounds(id_, stages):
 
 
 class CurriculumTest(parameterized.TestCase):
+    def test_stages_begin_when_episodes_are_long(self):
+        trainer = make(stages=settings.evenly([{}, {'start_phase': 0.25}]), stage_length=10.0)
+        n = TINY['num_envs']
+        everyone, nobody = np.ones(n, bool), np.zeros(n, bool)
+        for length, stage in ((9, 1), (10, 2), (10, 2)):  # there is no third stage
+            for step in range(length):
+                trainer.advance()  # without effect before episodes have ended
+                trainer.count(np.zeros(n), everyone if step == length - 1 else nobody)
+            trainer.advance()
+            self.assertEqual(trainer.stage, stage)
+
     def test_rising_walls(self):
         stages = settings.rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
         heights = [
@@ -451,6 +462,14 @@ class RunTest(FolderTest):
         (
             'another stage from a checkpoint on',
             {'stages': ((0.0, {}), (0.5, {'terrain': 'slopes'}))},
+        ),
+        (
+            'another stage after long episodes',
+            {
+                'stages': ((0.0, {}), (0.0, {'terrain': 'slopes'})),
+                'stage_length': 5.0,
+                'step_limit': 8,
+            },
         ),
         ('further', {'samples': 256, 'further': ({'value_first': 0.0},)}),
     )
