@@ -90,9 +90,7 @@ class Trainer:
         self.seed, self.settings, self.threads, s = seed, settings, threads, settings
         _check(s)
         self.samples, self.reached = 0, min(1, len(s.stages))
-        self.lengths = np.zeros(
-            2
-        )  # steps and number of episodes that ended since the last `advance`
+        self.lengths = np.zeros(2)  # steps and number of episodes since the last look at them
         self.begin_stage(self.stage)
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
